@@ -1,0 +1,47 @@
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+CONSTRAINTS := constraints.txt
+
+.DEFAULT_GOAL := help
+
+help:  ## List the targets
+	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 20
+
+$(BIN)/python:
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'pip>=25.1,<27'
+
+$(VENV)/.service: pyproject.toml $(CONSTRAINTS) | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS) -e '.[service]'
+	@touch $@
+
+$(VENV)/.dev: pyproject.toml $(CONSTRAINTS) | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS) -e '.[service,video]' --group dev
+	@touch $@ $(VENV)/.service
+
+$(VENV)/.training: pyproject.toml $(VENV)/.dev
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS) --group training
+	@touch $@
+
+setup: $(VENV)/.service  ## Make .venv with what the service needs
+
+setup-dev: $(VENV)/.dev  ## Make .venv with what tests and checks need
+
+serve: setup  ## Serve HTTP on 127.0.0.1:8080 and gRPC on 127.0.0.1:50051
+	$(BIN)/unbend serve
+
+test: setup-dev  ## Run the tests
+	$(BIN)/python -m pytest
+
+check: setup-dev  ## Lint, types, layers, generated code
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/python proto/generate.py --check
+
+proto: setup-dev  ## Generate client/unbend/v1 from proto/
+	$(BIN)/python proto/generate.py
+
+.PHONY: help setup setup-dev serve test check proto

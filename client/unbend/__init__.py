@@ -1,0 +1,1 @@
+"""Unbend's thin client."""

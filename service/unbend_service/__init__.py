@@ -1,0 +1,1 @@
+"""The Unbend service: estimation, rendering, HTTP and gRPC."""

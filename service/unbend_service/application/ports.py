@@ -1,0 +1,273 @@
+"""What the use cases need from the outside. Adapters implement these; ``wiring`` plugs them in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from unbend_service.domain.frames import Border, Frame
+from unbend_service.domain.grid import Grid
+from unbend_service.domain.guides import Guides
+from unbend_service.domain.records import GridRecord
+
+Bytes = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class ModelInfo:
+    """Which network answered.
+
+    Attributes:
+        name: short name, as the setting ``model`` takes it.
+        sha256: of the weight file, lower-case hex.
+    """
+
+    name: str
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """What an estimator says of one picture.
+
+    Attributes:
+        guides: estimated guides, centred coordinates.
+        confidence: 0..1; what it means is said by ``confidence_kind``.
+        confidence_kind: ``mirror_agreement`` or ``calibrated_probability``.
+        expected_error: expected mean error of the nonlinear part in half picture widths, None if the model has no say.
+        model: which network answered.
+    """
+
+    guides: Guides
+    confidence: float
+    confidence_kind: str
+    model: ModelInfo
+    expected_error: float | None = None
+
+
+class Estimator(Protocol):
+    """Looks at one picture. Thread-safe; blocking (the use case runs it off the event loop)."""
+
+    @property
+    def model(self) -> ModelInfo: ...
+
+    def estimate(self, grey: Bytes) -> Estimate:
+        """(height, width) uint8 grey, any size, upright -> Estimate."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class RendererInfo:
+    """Which renderer the workers run.
+
+    Attributes:
+        name: ``egl`` or ``cpu``.
+        device: the GL renderer string, or the name of the CPU path.
+        hardware: whether a GPU does the work.
+    """
+
+    name: str
+    device: str
+    hardware: bool
+
+
+class Renderer(Protocol):
+    """Draws one frame through a grid, inside a worker process. Not thread-safe; owns native contexts."""
+
+    @property
+    def info(self) -> RendererInfo: ...
+
+    def render(self, source: Frame, grid: Grid, border: Border, target: Bytes) -> None:
+        """Writes the corrected frame into ``target``.
+
+        A target pixel whose source point lies inside [-1, 1]^2 is sampled bilinearly, clamped at the edge of the
+        source; any other is painted with ``border``. Chroma planes are sampled at their own resolution. The target
+        has the format and size of ``source``.
+
+        Args:
+            source: the distorted frame.
+            grid: target -> source, already fitted.
+            target: (frame_size_bytes,) uint8, writable.
+        """
+        ...
+
+    def close(self) -> None: ...
+
+
+@dataclass(slots=True)
+class WorkerState:
+    """One render worker, for /readyz and metrics."""
+
+    name: str
+    state: str  # starting | ready | busy | dead
+    pid: int | None = None
+    restarts: int = 0
+
+
+@dataclass(slots=True)
+class PoolState:
+    """What the pool looks like now.
+
+    Attributes:
+        ready: whether a frame sent now would be rendered.
+        reason: why not, in one sentence.
+        queued: frames that wait for a worker.
+    """
+
+    ready: bool
+    reason: str
+    renderer: RendererInfo | None
+    queued: int
+    workers: list[WorkerState] = field(default_factory=list)
+
+
+class RenderPool(Protocol):
+    """Renders frames in worker processes."""
+
+    async def start(self) -> None:
+        """Starts the workers and waits until the first is ready.
+
+        Raises:
+            RendererUnavailable: none could be started, or a GPU is required and missing.
+        """
+        ...
+
+    async def render(
+        self, frame: Frame, grid: Grid, border: Border, *, affinity: str | None = None, deadline_s: float | None = None
+    ) -> Bytes:
+        """The corrected frame, (frame_size_bytes,) uint8, owned by the caller.
+
+        A worker that dies while it has the frame is replaced and the frame is rendered by another.
+
+        Args:
+            affinity: frames with the same key prefer the same worker, whose maps and textures are warm.
+            deadline_s: seconds from now after which the answer is worthless.
+
+        Raises:
+            QueueFull, DeadlineExceeded, PoisonFrame, RendererUnavailable, Draining.
+        """
+        ...
+
+    def state(self) -> PoolState: ...
+
+    async def close(self, grace_s: float) -> None:
+        """Finishes what was accepted, at most ``grace_s`` seconds, then ends the workers and frees shared memory."""
+        ...
+
+
+class GridStore(Protocol):
+    """Keeps grids by their content-derived id, and which grid a stream was given."""
+
+    async def put(self, record: GridRecord) -> None: ...
+
+    async def get(self, grid_id: str) -> GridRecord:
+        """Raises GridNotFound."""
+        ...
+
+    async def delete(self, grid_id: str) -> None:
+        """Raises GridNotFound."""
+        ...
+
+    async def bind_stream(self, stream_id: str, grid_id: str) -> None:
+        """Remembers the grid of a stream, so that a resumed stream gets the same one without a new estimate."""
+        ...
+
+    async def stream_grid(self, stream_id: str) -> str | None:
+        """The grid id that was bound, None if there is none (any more)."""
+        ...
+
+    async def close(self) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class ImageHeader:
+    """What the first bytes of an encoded image say, before anything is decoded.
+
+    Attributes:
+        image_format: ``jpeg``, ``png``, ``webp``, ``tiff`` or ``bmp``.
+        width, height: pixels as stored, before EXIF orientation.
+        has_alpha: whether the decoded image keeps an alpha channel.
+    """
+
+    image_format: str
+    width: int
+    height: int
+    has_alpha: bool
+
+
+@dataclass(frozen=True, slots=True)
+class DecodedImage:
+    """A decoded picture, upright (EXIF orientation applied).
+
+    Attributes:
+        frame: rgb24, rgba or gray8.
+        image_format: of the file it came from.
+        exif: EXIF block without its orientation, to be written back; None if there was none.
+        icc_profile: bytes to be written back; None if there was none or it no longer applies.
+    """
+
+    frame: Frame
+    image_format: str
+    exif: bytes | None = None
+    icc_profile: bytes | None = None
+
+
+class ImageCodec(Protocol):
+    """Encoded images to frames and back. Thread-safe; blocking."""
+
+    def probe(self, body: bytes) -> ImageHeader:
+        """Reads the header only.
+
+        Raises:
+            EmptyBody, UnsupportedMediaType, InvalidImage, TooManyPixels.
+        """
+        ...
+
+    def decode(self, body: bytes) -> DecodedImage:
+        """Raises as :meth:`probe`, and InvalidImage for a broken body."""
+        ...
+
+    def decode_grey(self, body: bytes, longest_px: int) -> Bytes:
+        """(height, width) uint8, upright, reduced so that the longer side is near ``longest_px`` (never enlarged)."""
+        ...
+
+    def encode(self, image: DecodedImage, image_format: str, quality: int) -> bytes:
+        """jpeg, png or webp with the EXIF block and ICC profile of ``image``; ``quality`` is 1..100.
+
+        Raises:
+            InvalidOption: a format that is not written.
+        """
+        ...
+
+
+class Meter(Protocol):
+    """Counts what happens. Never blocks, never raises."""
+
+    def request(self, transport: str, method: str, code: str, seconds: float) -> None: ...
+
+    def stage(self, stage: str, seconds: float) -> None:
+        """``stage`` is queue, decode, estimate, grid, render or encode."""
+        ...
+
+    def frame(self, result: str) -> None:
+        """``result`` is corrected, left_alone, dropped or failed."""
+        ...
+
+    def estimate(self, outcome: str) -> None: ...
+
+    def stream_opened(self) -> None: ...
+
+    def stream_closed(self) -> None: ...
+
+    def rejected(self, reason: str) -> None: ...
+
+    def worker_restarted(self, reason: str) -> None: ...
+
+    def grid_cache(self, hit: bool) -> None: ...
+
+    def pool(self, state: PoolState) -> None: ...
+
+    def model(self, model: ModelInfo) -> None: ...

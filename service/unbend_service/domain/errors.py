@@ -1,0 +1,215 @@
+"""Every error that Unbend raises on purpose.
+
+The tree (each leaf has a stable ``code``, which both transports put on the wire)::
+
+    UnbendError
+    ├── InvalidInput
+    │   ├── EmptyBody
+    │   ├── InvalidImage
+    │   ├── TooManyPixels
+    │   ├── UnsupportedMediaType
+    │   ├── BodyTooLarge
+    │   ├── InvalidOption
+    │   ├── InvalidGuides
+    │   ├── InvalidGrid
+    │   │   └── FoldedGrid
+    │   ├── InvalidFrame
+    │   ├── UnsupportedPixelFormat
+    │   └── ProtocolViolation
+    ├── GridNotFound
+    ├── GridConflict
+    ├── Overloaded
+    │   ├── QueueFull
+    │   └── TooManyStreams
+    ├── Unavailable
+    │   ├── Draining
+    │   └── RendererUnavailable
+    ├── RenderFailed
+    │   └── PoisonFrame
+    └── DeadlineExceeded
+
+The errors know neither HTTP nor gRPC: each transport owns one table from these classes to its own status codes.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+
+class UnbendError(Exception):
+    """Root of the tree.
+
+    Args:
+        message: what was wrong, in one sentence for the caller.
+        allowed: what would have been accepted, if that can be said.
+        setting: name of the setting that governs the limit, if one does.
+        retry_after_s: seconds after which trying again makes sense, if it does.
+    """
+
+    code: ClassVar[str] = "internal"
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        allowed: str | None = None,
+        setting: str | None = None,
+        retry_after_s: float | None = None,
+    ) -> None:
+        super().__init__(message)
+        self.message = message
+        self.allowed = allowed
+        self.setting = setting
+        self.retry_after_s = retry_after_s
+
+    def __str__(self) -> str:
+        parts = [self.message]
+        if self.allowed:
+            parts.append(f"Allowed: {self.allowed}.")
+        if self.setting:
+            parts.append(f"Setting: {self.setting}.")
+        return " ".join(parts)
+
+
+class InvalidInput(UnbendError, ValueError):
+    """The caller sent something that can never be accepted as it is."""
+
+    code = "invalid_input"
+
+
+class EmptyBody(InvalidInput):
+    """Nothing was sent where an image was expected."""
+
+    code = "empty_body"
+
+
+class InvalidImage(InvalidInput):
+    """The bytes have a known signature but cannot be decoded."""
+
+    code = "invalid_image"
+
+
+class TooManyPixels(InvalidInput):
+    """The image header announces more pixels than the service accepts."""
+
+    code = "too_many_pixels"
+
+
+class UnsupportedMediaType(InvalidInput):
+    """The bytes are not of an image format that is accepted."""
+
+    code = "unsupported_media_type"
+
+
+class BodyTooLarge(InvalidInput):
+    """More bytes than the service accepts."""
+
+    code = "body_too_large"
+
+
+class InvalidOption(InvalidInput):
+    """A parameter is out of range or unknown."""
+
+    code = "invalid_option"
+
+
+class InvalidGuides(InvalidInput):
+    """Guides of the wrong shape, not finite, or that do not intersect."""
+
+    code = "invalid_guides"
+
+
+class InvalidGrid(InvalidInput):
+    """A lattice of the wrong shape, not finite, or out of range."""
+
+    code = "invalid_grid"
+
+
+class FoldedGrid(InvalidGrid):
+    """The map turns over itself: its Jacobian changes sign over the visible part."""
+
+    code = "folded_grid"
+
+
+class InvalidFrame(InvalidInput):
+    """A frame whose size does not fit what its stream or header announced."""
+
+    code = "invalid_frame"
+
+
+class UnsupportedPixelFormat(InvalidInput):
+    """A pixel format that is not of the design."""
+
+    code = "unsupported_pixel_format"
+
+
+class ProtocolViolation(InvalidInput):
+    """Messages of a stream in the wrong order."""
+
+    code = "protocol_violation"
+
+
+class GridNotFound(UnbendError, LookupError):
+    """No grid is stored under that id."""
+
+    code = "grid_not_found"
+
+
+class GridConflict(UnbendError):
+    """The id in the request is not the id of the content that was sent."""
+
+    code = "grid_conflict"
+
+
+class Overloaded(UnbendError):
+    """The service is at one of its limits; trying later may help."""
+
+    code = "overloaded"
+
+
+class QueueFull(Overloaded):
+    """More work waits for a renderer than is allowed."""
+
+    code = "queue_full"
+
+
+class TooManyStreams(Overloaded):
+    """More streams are open than are allowed."""
+
+    code = "too_many_streams"
+
+
+class Unavailable(UnbendError):
+    """The service cannot work now."""
+
+    code = "unavailable"
+
+
+class Draining(Unavailable):
+    """The service is shutting down and accepts nothing new."""
+
+    code = "draining"
+
+
+class RendererUnavailable(Unavailable):
+    """No render worker could be started, or the required renderer is not there."""
+
+    code = "renderer_unavailable"
+
+
+class RenderFailed(UnbendError):
+    """A frame could not be rendered."""
+
+    code = "render_failed"
+
+
+class PoisonFrame(RenderFailed):
+    """A frame in whose rendering more than one worker died."""
+
+    code = "poison_frame"
+
+
+class DeadlineExceeded(UnbendError, TimeoutError):
+    """The work was not finished within its deadline."""
+
+    code = "deadline_exceeded"

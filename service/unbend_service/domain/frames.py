@@ -1,0 +1,168 @@
+"""Pixel formats and raw frames: how the bytes of one picture are laid out.
+
+Frames are pixels and nothing else: rows from top to bottom, no padding between rows, planes one after the other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+import numpy.typing as npt
+
+from unbend_service.domain.errors import InvalidFrame, UnsupportedPixelFormat
+
+Bytes = npt.NDArray[np.uint8]
+
+
+class PixelFormat(StrEnum):
+    """Raw pixel formats, named as FFmpeg names them where both have them."""
+
+    GRAY8 = "gray8"
+    RGB24 = "rgb24"
+    BGR24 = "bgr24"
+    RGBA = "rgba"
+    BGRA = "bgra"
+    I420 = "i420"
+    NV12 = "nv12"
+
+    @classmethod
+    def parse(cls, name: str) -> PixelFormat:
+        """Raises UnsupportedPixelFormat for a name that is not of the list."""
+        try:
+            return cls(name)
+        except ValueError:
+            raise UnsupportedPixelFormat(f"Unknown pixel format {name!r}.", allowed=", ".join(cls)) from None
+
+    @property
+    def has_alpha(self) -> bool:
+        return self in (PixelFormat.RGBA, PixelFormat.BGRA)
+
+
+@dataclass(frozen=True, slots=True)
+class Plane:
+    """One plane of a frame.
+
+    Attributes:
+        width, height: samples, in the plane's own resolution.
+        channels: interleaved samples per position.
+        offset: bytes from the start of the frame.
+        chroma: whether the plane carries colour differences, whose neutral value is 128.
+    """
+
+    width: int
+    height: int
+    channels: int
+    offset: int
+    chroma: bool
+
+    @property
+    def size_bytes(self) -> int:
+        return self.width * self.height * self.channels
+
+
+_PACKED_CHANNELS = {
+    PixelFormat.GRAY8: 1,
+    PixelFormat.RGB24: 3,
+    PixelFormat.BGR24: 3,
+    PixelFormat.RGBA: 4,
+    PixelFormat.BGRA: 4,
+}
+
+
+def planes(pixel_format: PixelFormat, width: int, height: int) -> tuple[Plane, ...]:
+    """The planes of a frame of ``width`` x ``height`` pixels; half-resolution chroma is rounded up for odd sizes."""
+    if channels := _PACKED_CHANNELS.get(pixel_format):
+        return (Plane(width, height, channels, 0, False),)
+    luma = Plane(width, height, 1, 0, False)
+    half_width, half_height = (width + 1) // 2, (height + 1) // 2
+    if pixel_format is PixelFormat.NV12:
+        return luma, Plane(half_width, half_height, 2, luma.size_bytes, True)
+    u = Plane(half_width, half_height, 1, luma.size_bytes, True)
+    return luma, u, Plane(half_width, half_height, 1, u.offset + u.size_bytes, True)
+
+
+def frame_size_bytes(pixel_format: PixelFormat, width: int, height: int) -> int:
+    """Bytes of one frame."""
+    return sum(plane.size_bytes for plane in planes(pixel_format, width, height))
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One raw picture.
+
+    Attributes:
+        pixel_format: how ``data`` is laid out.
+        width, height: pixels, both at least 1.
+        data: (size_bytes,) uint8, C-contiguous, possibly a read-only view of somebody else's buffer.
+    """
+
+    pixel_format: PixelFormat
+    width: int
+    height: int
+    data: Bytes
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise InvalidFrame(f"A frame of {self.width}x{self.height} pixels has no picture.")
+        expected = frame_size_bytes(self.pixel_format, self.width, self.height)
+        if self.data.dtype != np.uint8 or self.data.ndim != 1 or self.data.size != expected:
+            raise InvalidFrame(
+                f"A {self.pixel_format} frame of {self.width}x{self.height} pixels has {expected} bytes, "
+                f"not {self.data.nbytes}."
+            )
+
+    def plane_arrays(self) -> tuple[Bytes, ...]:
+        """Views of ``data``, one (height, width, channels) uint8 array per plane (no channel axis if there is one)."""
+        return split_planes(self.data, self.pixel_format, self.width, self.height)
+
+
+def split_planes(data: Bytes, pixel_format: PixelFormat, width: int, height: int) -> tuple[Bytes, ...]:
+    """Views into flat ``data``: (h, w) per plane of one channel, (h, w, channels) otherwise."""
+    views = []
+    for plane in planes(pixel_format, width, height):
+        flat = data[plane.offset : plane.offset + plane.size_bytes]
+        shape = (plane.height, plane.width) if plane.channels == 1 else (plane.height, plane.width, plane.channels)
+        views.append(flat.reshape(shape))
+    return tuple(views)
+
+
+@dataclass(frozen=True, slots=True)
+class Border:
+    """What is painted where the map points outside the source.
+
+    Attributes:
+        red, green, blue: 0..255, full range; converted to the frame's own colours by :meth:`samples`.
+        alpha: 0..255, used where the format has alpha.
+    """
+
+    red: int = 0
+    green: int = 0
+    blue: int = 0
+    alpha: int = 255
+
+    def samples(self, pixel_format: PixelFormat) -> tuple[tuple[int, ...], ...]:
+        """Sample values, one tuple per plane, one number per channel.
+
+        YUV is BT.601 in video range (ITU-R BT.601-7, section 2.5), the convention of 8-bit i420 and nv12.
+        """
+        r, g, b = self.red, self.green, self.blue
+        if pixel_format is PixelFormat.GRAY8:
+            return ((round(0.299 * r + 0.587 * g + 0.114 * b),),)
+        if pixel_format is PixelFormat.RGB24:
+            return ((r, g, b),)
+        if pixel_format is PixelFormat.BGR24:
+            return ((b, g, r),)
+        if pixel_format is PixelFormat.RGBA:
+            return ((r, g, b, self.alpha),)
+        if pixel_format is PixelFormat.BGRA:
+            return ((b, g, r, self.alpha),)
+        luma = round(16 + (65.481 * r + 128.553 * g + 24.966 * b) / 255)
+        u = round(128 + (-37.797 * r - 74.203 * g + 112.0 * b) / 255)
+        v = round(128 + (112.0 * r - 93.786 * g - 18.214 * b) / 255)
+        return ((luma,), (u, v)) if pixel_format is PixelFormat.NV12 else ((luma,), (u,), (v,))
+
+
+BLACK = Border()
+TRANSPARENT = Border(alpha=0)

@@ -1,0 +1,192 @@
+"""Grid: the lattice that a renderer samples, and what may be asked of it."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from unbend_service.domain.errors import FoldedGrid, InvalidGrid
+from unbend_service.domain.maps import BackwardMap, Float64, target_lattice
+
+Float32 = npt.NDArray[np.float32]
+
+DEFAULT_POINTS = 65
+MAX_POINTS = 1025
+#: Source points further out than this are refused: no lens, only a broken file, puts them there.
+MAX_SOURCE = 16.0
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """A lattice of source points for a regular lattice over the target; as a callable, its backward map.
+
+    Attributes:
+        source: (rows, columns, 2) float32, read-only, row-major. ``source[r, c] = (x, y)`` is the centred source point
+            of the centred target point (2 c / (columns - 1) - 1, 2 r / (rows - 1) - 1).
+
+    Raises:
+        InvalidGrid: wrong shape or size, not finite, or further out than MAX_SOURCE.
+    """
+
+    source: Float32
+
+    def __post_init__(self) -> None:
+        with np.errstate(over="ignore"):
+            source = np.array(self.source, dtype=np.float32, order="C")
+        if source.ndim != 3 or source.shape[2] != 2 or not all(2 <= n <= MAX_POINTS for n in source.shape[:2]):
+            raise InvalidGrid(
+                f"A grid of shape {source.shape}.",
+                allowed=f"(rows, columns, 2), 2 to {MAX_POINTS} of each",
+            )
+        if not np.isfinite(source).all():
+            raise InvalidGrid("The grid has a number that is not finite.", allowed="finite numbers")
+        if np.abs(source).max() > MAX_SOURCE:
+            raise InvalidGrid("The grid has a source point too far out.", allowed=f"-{MAX_SOURCE:g} to {MAX_SOURCE:g}")
+        source += np.float32(0)  # -0.0 becomes 0.0, so that equal grids have equal ids
+        source.flags.writeable = False
+        object.__setattr__(self, "source", source)
+
+    @classmethod
+    def identity(cls, rows: int = DEFAULT_POINTS, columns: int = DEFAULT_POINTS) -> Grid:
+        """The grid that changes nothing."""
+        return cls(target_lattice(rows, columns).astype(np.float32))
+
+    @classmethod
+    def from_map(cls, backward: BackwardMap, rows: int = DEFAULT_POINTS, columns: int = DEFAULT_POINTS) -> Grid:
+        """Samples ``backward`` at the lattice points."""
+        return cls(backward(target_lattice(rows, columns)).astype(np.float32))
+
+    @property
+    def rows(self) -> int:
+        return int(self.source.shape[0])
+
+    @property
+    def columns(self) -> int:
+        return int(self.source.shape[1])
+
+    @cached_property
+    def id(self) -> str:
+        """Content-derived: SHA-256 over the shape and the little-endian float32 points, 128 bits of it in hex."""
+        digest = hashlib.sha256(f"unbend grid 1 {self.rows} {self.columns}\n".encode())
+        digest.update(self.source.astype("<f4").tobytes())
+        return "g" + digest.hexdigest()[:32]
+
+    def __call__(self, target: Float64) -> Float64:
+        """Bilinear in each cell; outside [-1, 1] the lattice is continued quadratically.
+
+        Args:
+            target: (..., 2) float64 centred target points.
+
+        Returns:
+            (..., 2) float64 centred source points.
+        """
+        target = np.asarray(target, dtype=np.float64)
+        extent = float(np.abs(target).max(initial=0))
+        lattice, margin = self._continued(extent) if extent > 1 else (self.source.astype(np.float64), 0)
+        column = (target[..., 0] + 1) / 2 * (self.columns - 1) + margin
+        row = (target[..., 1] + 1) / 2 * (self.rows - 1) + margin
+        c = np.clip(column.astype(np.intp), 0, lattice.shape[1] - 2)
+        r = np.clip(row.astype(np.intp), 0, lattice.shape[0] - 2)
+        u, v = (column - c)[..., None], (row - r)[..., None]
+        top = lattice[r, c] * (1 - u) + lattice[r, c + 1] * u
+        bottom = lattice[r + 1, c] * (1 - u) + lattice[r + 1, c + 1] * u
+        return np.asarray(top * (1 - v) + bottom * v)
+
+    def _continued(self, extent: float) -> tuple[Float64, int]:
+        """The lattice with a margin of cells on each side, enough for +-extent."""
+        margin = int(np.ceil((extent - 1) / 2 * (max(self.rows, self.columns) - 1))) + 1
+        lattice = _continue_axis(self.source.astype(np.float64), margin)
+        return _continue_axis(lattice.transpose(1, 0, 2), margin).transpose(1, 0, 2), margin
+
+    @cached_property
+    def displacement(self) -> float:
+        """Mean length of source - target over the lattice, in half picture widths (1 px at width W is 2 / W)."""
+        offset = self.source - target_lattice(self.rows, self.columns)
+        return float(np.hypot(offset[..., 0], offset[..., 1]).mean())
+
+    def check_unfolded(self) -> None:
+        """Raises FoldedGrid unless the Jacobian keeps its sign in every cell that shows some of the source."""
+        if folded_share(self.source) > 0:
+            raise FoldedGrid(
+                "The grid folds over itself inside the picture.",
+                allowed="a lattice whose cells all keep the same orientation",
+            )
+
+    def to_dict(self) -> dict[str, Any]:
+        """The ``grid`` object of the API: {rows, columns, source: [[x, y], ...]}; the round trip is exact."""
+        points = self.source.reshape(-1, 2).astype(np.float64).tolist()
+        return {"rows": self.rows, "columns": self.columns, "source": points}
+
+    @classmethod
+    def from_dict(cls, value: Any) -> Grid:
+        """Inverse of :meth:`to_dict`; raises InvalidGrid for anything else."""
+        if not isinstance(value, dict) or not {"rows", "columns", "source"} <= value.keys():
+            raise InvalidGrid("A grid must be an object with rows, columns and source.")
+        rows, columns, points = value["rows"], value["columns"], value["source"]
+        if type(rows) is not int or type(columns) is not int or not isinstance(points, list):
+            raise InvalidGrid("rows and columns must be integers and source a list of [x, y].")
+        if not (2 <= rows <= MAX_POINTS and 2 <= columns <= MAX_POINTS) or len(points) != rows * columns:
+            raise InvalidGrid(
+                f"{len(points)} source points for {rows} rows and {columns} columns.",
+                allowed=f"rows x columns points, 2 to {MAX_POINTS} of each",
+            )
+        try:
+            array = np.array(points, dtype=np.float64)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise InvalidGrid("source must be a list of [x, y] numbers.") from error
+        if array.shape != (rows * columns, 2):
+            raise InvalidGrid("source must be a list of [x, y] numbers.")
+        return cls(array.reshape(rows, columns, 2))
+
+
+def _continue_axis(lattice: Float64, margin: int) -> Float64:
+    """Adds ``margin`` rows before and after, on the parabola through three rows of the outer quarter."""
+    count = len(lattice)
+    step = max(1, (count - 1) // 8)
+    if count < 2 * step + 1:
+        distance = np.arange(1, margin + 1)[:, None, None]
+        before = lattice[0] + distance[::-1] * (lattice[0] - lattice[1])
+        after = lattice[-1] + distance * (lattice[-1] - lattice[-2])
+        return np.concatenate([before, lattice, after])
+    k = (np.arange(1, margin + 1) / step)[:, None, None]
+
+    def beyond(edge: Float64, inner: Float64, innermost: Float64) -> Float64:
+        return edge * (1 + k) * (2 + k) / 2 - inner * k * (2 + k) + innermost * k * (1 + k) / 2
+
+    before = beyond(lattice[0], lattice[step], lattice[2 * step])[::-1]
+    after = beyond(lattice[-1], lattice[-1 - step], lattice[-1 - 2 * step])
+    return np.concatenate([before, lattice, after])
+
+
+def cell_orientations(source: npt.NDArray[Any]) -> Float64:
+    """(rows - 1, columns - 1, 4) signed areas of the corner triangles of each cell, of a (rows, columns, 2) lattice."""
+    lattice = np.asarray(source, dtype=np.float64)
+    a, b, c, d = lattice[:-1, :-1], lattice[:-1, 1:], lattice[1:, 1:], lattice[1:, :-1]
+
+    def cross(p: Float64, q: Float64, r: Float64) -> Float64:
+        return np.asarray(
+            (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (r[..., 0] - p[..., 0])
+        )
+
+    return np.stack([cross(a, b, d), cross(b, c, a), cross(c, d, b), cross(d, a, c)], axis=-1)
+
+
+def folded_share(source: npt.NDArray[Any]) -> float:
+    """Share of the cells that show some of the source and do not keep the orientation of the others.
+
+    A lattice that shows nothing of the source counts as folded everywhere.
+    """
+    lattice = np.asarray(source, dtype=np.float64)
+    low = np.minimum.reduce([lattice[:-1, :-1], lattice[:-1, 1:], lattice[1:, 1:], lattice[1:, :-1]])
+    high = np.maximum.reduce([lattice[:-1, :-1], lattice[:-1, 1:], lattice[1:, 1:], lattice[1:, :-1]])
+    visible = ((low <= 1) & (high >= -1)).all(axis=-1)
+    if not visible.any():
+        return 1.0
+    orientation = cell_orientations(lattice)[visible]
+    sign = 1.0 if np.median(orientation) > 0 else -1.0
+    return float((orientation * sign <= 0).any(axis=-1).mean())

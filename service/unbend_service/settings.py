@@ -1,0 +1,59 @@
+"""Settings: read once, from the environment (``UNBEND_...``) and the command line, and passed down."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+
+class Settings(BaseSettings):
+    """Every setting of the service; the environment variable is the name in capitals after ``UNBEND_``."""
+
+    model_config = SettingsConfigDict(env_prefix="UNBEND_", extra="ignore")
+
+    http_host: str = Field("127.0.0.1", description="Address that HTTP listens on.")
+    http_port: int = Field(8080, ge=0, le=65535, description="Port of HTTP; 0 takes a free one.")
+    grpc_host: str = Field("127.0.0.1", description="Address that gRPC listens on.")
+    grpc_port: int = Field(50051, ge=0, le=65535, description="Port of gRPC; 0 takes a free one.")
+    role: Literal["all", "estimate", "render"] = Field("all", description="Which half of the work this process does.")
+
+    renderer: Literal["auto", "egl", "cpu"] = Field("auto", description="auto: EGL on a hardware GPU, else cpu.")
+    require_gpu: bool = Field(False, description="Not ready on a software renderer.")
+    workers: int = Field(0, ge=0, le=256, description="Render worker processes; 0: one per usable core.")
+    slots_per_worker: int = Field(2, ge=1, le=16, description="Frames that a worker may hold at once.")
+    shared_memory_bytes: int = Field(
+        1 << 30, ge=1 << 20, description="Upper bound of the shared memory for frames under way."
+    )
+    queue_frames: int = Field(64, ge=1, description="Frames that may wait for a renderer; one more is refused.")
+    render_deadline_s: float = Field(30.0, gt=0, description="Longest time from acceptance to answer of one frame.")
+
+    model: str = Field("first", description="Estimator: the name of a model that ships, or a path to one.")
+    estimator_threads: int = Field(0, ge=0, le=256, description="Threads of one estimate; 0: as many as usable cores.")
+    min_confidence: float = Field(
+        0.0, ge=0, le=1, description="Below this confidence a picture is left alone, unless the request says otherwise."
+    )
+    grid_points: int = Field(65, ge=9, le=257, description="Rows and columns of the grids that are made.")
+
+    body_bytes: int = Field(64 << 20, ge=1024, description="Largest request body; a larger one is refused with 413.")
+    source_pixels: int = Field(100_000_000, ge=1, description="Most pixels of a source image.")
+    animation_frames: int = Field(1, ge=1, description="Most frames of an animated image.")
+    jpeg_quality: int = Field(92, ge=1, le=100, description="Quality when the request names none.")
+
+    streams: int = Field(256, ge=1, description="Streams that may be open at once.")
+    stream_in_flight: int = Field(8, ge=1, le=256, description="Frames of one stream that may be under way at once.")
+    stream_idle_s: float = Field(60.0, gt=0, description="A stream without a frame for so long is closed.")
+    stream_estimate_frames: int = Field(
+        5, ge=1, le=64, description="Frames that the grid of a stream is estimated over, unless the stream says."
+    )
+
+    grid_store: Literal["memory", "sqlite"] = Field("memory", description="Where grids are kept.")
+    grid_store_path: Path = Field(Path("unbend-grids.sqlite3"), description="File of the sqlite grid store.")
+    grid_store_entries: int = Field(10_000, ge=1, description="Most grids that are kept; the oldest goes first.")
+    grid_store_ttl_s: float = Field(30 * 86_400.0, gt=0, description="Seconds after its last use that a grid is kept.")
+
+    drain_s: float = Field(20.0, ge=0, description="Grace for accepted work after SIGTERM.")
+    log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="Least severe log line.")
+    log_format: Literal["console", "json"] = Field("console", description="How log lines look.")
