@@ -207,12 +207,14 @@ class DecodedImage:
         image_format: of the file it came from.
         exif: EXIF block without its orientation, to be written back; None if there was none.
         icc_profile: bytes to be written back; None if there was none or it no longer applies.
+        upright: whether the file was stored upright, so that its own bytes show the same picture.
     """
 
     frame: Frame
     image_format: str
     exif: bytes | None = None
     icc_profile: bytes | None = None
+    upright: bool = True
 
 
 class ImageCodec(Protocol):

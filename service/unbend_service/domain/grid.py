@@ -109,9 +109,14 @@ class Grid:
         offset = self.source - target_lattice(self.rows, self.columns)
         return float(np.hypot(offset[..., 0], offset[..., 1]).mean())
 
+    @cached_property
+    def is_unfolded(self) -> bool:
+        """Whether the Jacobian keeps its sign in every cell that shows some of the source."""
+        return folded_share(self.source) == 0
+
     def check_unfolded(self) -> None:
-        """Raises FoldedGrid unless the Jacobian keeps its sign in every cell that shows some of the source."""
-        if folded_share(self.source) > 0:
+        """Raises FoldedGrid unless the grid is unfolded."""
+        if not self.is_unfolded:
             raise FoldedGrid(
                 "The grid folds over itself inside the picture.",
                 allowed="a lattice whose cells all keep the same orientation",

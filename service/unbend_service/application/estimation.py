@@ -1,0 +1,98 @@
+"""Estimate: one picture in, the grid that straightens it out."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from unbend_service.application.blocking import BlockingWork
+from unbend_service.application.fitting import FittedGrids
+from unbend_service.application.ports import Bytes, Estimate, Estimator, GridStore, ImageCodec, Meter
+from unbend_service.domain.decision import decide
+from unbend_service.domain.errors import InvalidOption
+from unbend_service.domain.fit import KEEP, Fit
+from unbend_service.domain.records import Correct, GridRecord
+
+#: Longer side to which pictures are reduced before an estimator sees them.
+ESTIMATE_LONGEST_PX = 1024
+
+
+def check_confidence(min_confidence: float) -> float:
+    """Raises InvalidOption unless 0 <= min_confidence <= 1."""
+    if not 0 <= min_confidence <= 1:
+        raise InvalidOption(f"min_confidence={min_confidence!r} is out of range.", allowed="0..1")
+    return min_confidence
+
+
+class Estimation:
+    """Runs the estimator off the event loop, decides, and stores what was decided."""
+
+    def __init__(
+        self,
+        estimator: Estimator,
+        codec: ImageCodec,
+        store: GridStore,
+        grids: FittedGrids,
+        blocking: BlockingWork,
+        meter: Meter,
+        *,
+        grid_points: int,
+        min_confidence: float,
+    ) -> None:
+        self._estimator = estimator
+        self._codec = codec
+        self._store = store
+        self._grids = grids
+        self._blocking = blocking
+        self._meter = meter
+        self._grid_points = grid_points
+        self._min_confidence = min_confidence
+
+    async def of_grey(self, grey: Bytes) -> Estimate:
+        """What the estimator says of a (height, width) uint8 picture."""
+        return await self._blocking.run("estimate", self._estimator.estimate, grey)
+
+    async def record(self, estimate: Estimate, correct: Correct, min_confidence: float | None = None) -> GridRecord:
+        """The decision on an estimate, at full strength and without fit; stored and counted."""
+        threshold = self._min_confidence if min_confidence is None else check_confidence(min_confidence)
+        record = await self._blocking.run(
+            "grid",
+            decide,
+            estimate.guides,
+            estimate.confidence,
+            estimate.confidence_kind,
+            estimate.model.name,
+            correct=correct,
+            min_confidence=threshold,
+            points=self._grid_points,
+        )
+        self._meter.estimate(record.outcome.value)
+        await self._store.put(record)
+        return record
+
+    async def of_image(
+        self,
+        body: bytes,
+        correct: Correct = Correct.NONLINEAR,
+        fit: Fit = KEEP,
+        strength: float = 1.0,
+        min_confidence: float | None = None,
+    ) -> GridRecord:
+        """Estimates an encoded picture; the stored grid is the one that correct, fit and strength describe.
+
+        Raises:
+            EmptyBody, UnsupportedMediaType, InvalidImage, TooManyPixels, InvalidOption, QueueFull.
+        """
+        grey = await self._blocking.run("decode", self._codec.decode_grey, body, ESTIMATE_LONGEST_PX)
+        return await self.of_grey_described(grey, correct, fit, strength, min_confidence)
+
+    async def of_grey_described(
+        self, grey: Bytes, correct: Correct, fit: Fit, strength: float, min_confidence: float | None
+    ) -> GridRecord:
+        """As :meth:`of_image`, for a (height, width) uint8 picture."""
+        record = await self.record(await self.of_grey(grey), correct, min_confidence)
+        grid = await self._grids.get(record.grid, fit, strength)
+        if grid is record.grid:
+            return record
+        described = dataclasses.replace(record, grid=grid, strength=record.strength * strength)
+        await self._store.put(described)
+        return described

@@ -1,0 +1,73 @@
+"""The application as the transports see it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+from unbend_service.application.admission import Admission
+from unbend_service.application.blocking import BlockingWork
+from unbend_service.application.correction import Correction
+from unbend_service.application.estimation import Estimation
+from unbend_service.application.grids import GridLibrary
+from unbend_service.application.ports import GridStore, ImageCodec, Meter, ModelInfo, PoolState, RenderPool
+from unbend_service.application.streams import Streams
+
+
+@dataclass(frozen=True, slots=True)
+class Readiness:
+    """Whether calls sent now would be answered.
+
+    Attributes:
+        reasons: why not, one sentence each; empty when ready.
+        pool: the render workers.
+        model: the network that estimates.
+        streams: streams that are open.
+        active: calls under way.
+    """
+
+    ready: bool
+    reasons: list[str]
+    pool: PoolState
+    model: ModelInfo
+    streams: int
+    active: int
+
+
+@dataclass(slots=True)
+class Service:
+    """Use cases and what they share."""
+
+    estimation: Estimation
+    correction: Correction
+    grids: GridLibrary
+    streams: Streams
+    pool: RenderPool
+    store: GridStore
+    codec: ImageCodec
+    meter: Meter
+    blocking: BlockingWork
+    model: ModelInfo
+    admission: Admission = field(default_factory=Admission)
+
+    async def start(self) -> None:
+        """Starts the render workers. Raises RendererUnavailable."""
+        await self.pool.start()
+        self.meter.model(self.model)
+        self.meter.pool(self.pool.state())
+
+    def readiness(self) -> Readiness:
+        """Cheap; asked by probes."""
+        state = self.pool.state()
+        reasons = [] if state.ready else [state.reason]
+        if self.admission.draining:
+            reasons.append("The service is shutting down.")
+        return Readiness(not reasons, reasons, state, self.model, self.streams.active, self.admission.active)
+
+    async def close(self, grace_s: float) -> None:
+        """Refuses new calls, lets those under way finish for ``grace_s`` seconds, then frees everything."""
+        end = time.monotonic() + grace_s
+        await self.admission.drain(grace_s)
+        await self.pool.close(max(0.0, end - time.monotonic()))
+        self.blocking.close()
+        await self.store.close()
