@@ -23,6 +23,7 @@ The tree (each leaf has a stable ``code``, which both transports put on the wire
     │   └── TooManyStreams
     ├── Unavailable
     │   ├── Draining
+    │   ├── ModelUnavailable
     │   └── RendererUnavailable
     ├── RenderFailed
     │   └── PoisonFrame
@@ -189,6 +190,12 @@ class Draining(Unavailable):
     """The service is shutting down and accepts nothing new."""
 
     code = "draining"
+
+
+class ModelUnavailable(Unavailable):
+    """The model that the setting names is not there, or its weights are not what its card says."""
+
+    code = "model_unavailable"
 
 
 class RendererUnavailable(Unavailable):
