@@ -27,6 +27,9 @@ The tree (each leaf has a stable ``code``, which both transports put on the wire
     │   └── RendererUnavailable
     ├── RenderFailed
     │   └── PoisonFrame
+    ├── StreamEnded
+    │   ├── StreamTakenOver
+    │   └── StreamIdle
     └── DeadlineExceeded
 
 The errors know neither HTTP nor gRPC: each transport owns one table from these classes to its own status codes.
@@ -214,6 +217,24 @@ class PoisonFrame(RenderFailed):
     """A frame in whose rendering more than one worker died."""
 
     code = "poison_frame"
+
+
+class StreamEnded(UnbendError):
+    """The service ended a stream that the client had not finished."""
+
+    code = "stream_ended"
+
+
+class StreamTakenOver(StreamEnded):
+    """The stream was opened again elsewhere with the same id; the newer connection has it."""
+
+    code = "stream_taken_over"
+
+
+class StreamIdle(StreamEnded):
+    """No frame came and no answer was taken for longer than is allowed."""
+
+    code = "stream_idle"
 
 
 class DeadlineExceeded(UnbendError, TimeoutError):
