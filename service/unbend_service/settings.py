@@ -18,7 +18,6 @@ class Settings(BaseSettings):
     http_port: int = Field(8080, ge=0, le=65535, description="Port of HTTP; 0 takes a free one.")
     grpc_host: str = Field("127.0.0.1", description="Address that gRPC listens on.")
     grpc_port: int = Field(50051, ge=0, le=65535, description="Port of gRPC; 0 takes a free one.")
-    role: Literal["all", "estimate", "render"] = Field("all", description="Which half of the work this process does.")
 
     renderer: Literal["auto", "egl", "cpu"] = Field("auto", description="auto: EGL on a hardware GPU, else cpu.")
     require_gpu: bool = Field(False, description="Not ready on a software renderer.")
@@ -57,3 +56,12 @@ class Settings(BaseSettings):
     drain_s: float = Field(20.0, ge=0, description="Grace for accepted work after SIGTERM.")
     log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="Least severe log line.")
     log_format: Literal["console", "json"] = Field("console", description="How log lines look.")
+
+
+def settings_table() -> str:
+    """Markdown table of every setting, for the README."""
+    lines = ["| Variable | Default | Meaning |", "|---|---|---|"]
+    for name, field in Settings.model_fields.items():
+        default = "unset" if field.default is None else f"`{field.default}`"
+        lines.append(f"| `UNBEND_{name.upper()}` | {default} | {field.description} |")
+    return "\n".join(lines)

@@ -1,0 +1,25 @@
+"""The command line: one verb a module."""
+
+from __future__ import annotations
+
+import typer
+
+from unbend_service.cli.correct import correct
+from unbend_service.cli.doctor import doctor
+from unbend_service.cli.estimate import estimate
+from unbend_service.cli.serve import serve
+
+app = typer.Typer(
+    name="unbend",
+    help="Straightens photographs and video from unknown cameras.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+for verb in (serve, correct, estimate, doctor):
+    app.command()(verb)
+
+
+def main() -> None:
+    """Entry point of the ``unbend`` command."""
+    app()

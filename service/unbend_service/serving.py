@@ -1,0 +1,130 @@
+"""The life of the service process: start, serve both transports, drain, stop."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import grpc
+import structlog
+import uvicorn
+
+from unbend_service.application.service import Service
+from unbend_service.settings import Settings
+from unbend_service.transport.rest.app import create_app
+from unbend_service.transport.rpc.server import start_server
+from unbend_service.wiring import build_service
+
+log = structlog.get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Addresses:
+    """Where the service listens: host:port of each transport, with the ports that were really taken."""
+
+    http: str
+    grpc: str
+
+
+class _HttpServer(uvicorn.Server):
+    """Uvicorn without its own signal handling: the process drains both transports together."""
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+
+async def serve(settings: Settings, on_ready: Callable[[Addresses], None] | None = None) -> None:
+    """Serves until SIGTERM or SIGINT, then drains; a second signal ends the process at once.
+
+    Raises:
+        UnbendError: the service cannot start with these settings.
+        OSError: an address is taken.
+    """
+    stop = asyncio.Event()
+    _handle_signals(stop)
+    service = build_service(settings)
+    try:
+        await service.start()
+        rpc_server, rpc_port = await start_server(service, settings)
+        http_server = _HttpServer(
+            uvicorn.Config(
+                create_app(service, settings),
+                host=settings.http_host,
+                port=settings.http_port,
+                http="httptools",
+                ws="none",
+                lifespan="off",
+                access_log=False,
+                log_config=None,
+                server_header=False,
+                timeout_graceful_shutdown=max(1, round(settings.drain_s)),
+            )
+        )
+        serving = asyncio.create_task(http_server.serve())
+        await _started(http_server, serving)
+        addresses = Addresses(
+            f"{settings.http_host}:{_bound_port(http_server)}",
+            f"{settings.grpc_host}:{rpc_port}",
+        )
+        pool = service.pool.state()
+        renderer = pool.renderer
+        log.info(
+            "ready",
+            http=addresses.http,
+            grpc=addresses.grpc,
+            renderer=renderer.name if renderer else None,
+            device=renderer.device if renderer else None,
+            hardware=renderer.hardware if renderer else None,
+            workers=len(pool.workers),
+            model=service.model.name,
+        )
+        if on_ready is not None:
+            on_ready(addresses)
+        stopping = asyncio.create_task(stop.wait())
+        await asyncio.wait({serving, stopping}, return_when=asyncio.FIRST_COMPLETED)
+        await _drain(service, settings, http_server, serving, rpc_server)
+    finally:
+        await service.close(0.0)
+
+
+async def _drain(
+    service: Service,
+    settings: Settings,
+    http_server: uvicorn.Server,
+    serving: asyncio.Task[None],
+    rpc_server: grpc.aio.Server,
+) -> None:
+    log.info("draining", grace_s=settings.drain_s, active=service.admission.active)
+    finished = await service.admission.drain(settings.drain_s)
+    http_server.should_exit = True
+    await asyncio.gather(rpc_server.stop(1.0), serving)
+    log.info("stopped", finished=finished)
+
+
+async def _started(server: uvicorn.Server, serving: asyncio.Task[None]) -> None:
+    while not server.started:
+        if serving.done():
+            await serving
+            raise OSError(f"HTTP cannot listen on {server.config.host}:{server.config.port}")
+        await asyncio.sleep(0.01)
+
+
+def _bound_port(server: uvicorn.Server) -> int:
+    return int(server.servers[0].sockets[0].getsockname()[1])
+
+
+def _handle_signals(stop: asyncio.Event) -> None:
+    loop = asyncio.get_running_loop()
+
+    def on_signal() -> None:
+        if stop.is_set():
+            os._exit(1)
+        stop.set()
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, on_signal)

@@ -1,0 +1,72 @@
+"""The one module that names concrete adapters and plugs them into the use cases."""
+
+from __future__ import annotations
+
+import os
+
+from unbend_service.adapters.codecs.pillow import PillowCodec
+from unbend_service.adapters.estimators.catalogue import load_estimator
+from unbend_service.adapters.grid_stores.memory import MemoryGridStore
+from unbend_service.adapters.grid_stores.sqlite import SqliteGridStore
+from unbend_service.adapters.metrics.prometheus import PrometheusMeter
+from unbend_service.adapters.renderers.pool import WorkerPool
+from unbend_service.application.blocking import BlockingWork
+from unbend_service.application.correction import Correction
+from unbend_service.application.estimation import Estimation
+from unbend_service.application.fitting import FittedGrids
+from unbend_service.application.grids import GridLibrary
+from unbend_service.application.ports import GridStore
+from unbend_service.application.service import Service
+from unbend_service.application.streams import Streams
+from unbend_service.settings import Settings
+
+
+def usable_cores() -> int:
+    """Cores that this process may run on."""
+    return len(os.sched_getaffinity(0))
+
+
+def build_store(settings: Settings) -> GridStore:
+    """The embedded grid store that the settings name."""
+    if settings.grid_store == "sqlite":
+        return SqliteGridStore(settings)
+    return MemoryGridStore(settings)
+
+
+def build_service(settings: Settings, meter: PrometheusMeter | None = None) -> Service:
+    """The whole application, not yet started.
+
+    Raises:
+        InvalidOption: the model is not known or its file is broken.
+    """
+    meter = meter or PrometheusMeter()
+    blocking = BlockingWork(usable_cores(), settings.queue_frames, meter)
+    codec = PillowCodec(settings)
+    store = build_store(settings)
+    fitted_grids = FittedGrids(blocking, meter)
+    pool = WorkerPool(settings, meter)
+    estimator = load_estimator(settings.model, settings.estimator_threads or usable_cores())
+    estimation = Estimation(
+        estimator,
+        codec,
+        store,
+        fitted_grids,
+        blocking,
+        meter,
+        grid_points=settings.grid_points,
+        min_confidence=settings.min_confidence,
+    )
+    correction = Correction(
+        estimation,
+        codec,
+        store,
+        fitted_grids,
+        pool,
+        blocking,
+        meter,
+        jpeg_quality=settings.jpeg_quality,
+        deadline_s=settings.render_deadline_s,
+    )
+    grids = GridLibrary(store, grid_points=settings.grid_points)
+    streams = Streams(estimation, correction, store, codec, blocking, meter, settings)
+    return Service(estimation, correction, grids, streams, pool, store, codec, meter, blocking, estimator.model)
