@@ -208,6 +208,7 @@ class DecodedImage:
         exif: EXIF block without its orientation, to be written back; None if there was none.
         icc_profile: bytes to be written back; None if there was none or it no longer applies.
         upright: whether the file was stored upright, so that its own bytes show the same picture.
+        chroma_subsampling: of a jpeg, ``4:4:4``, ``4:2:2`` or ``4:2:0``, kept when jpeg is written; None if unknown.
     """
 
     frame: Frame
@@ -215,6 +216,7 @@ class DecodedImage:
     exif: bytes | None = None
     icc_profile: bytes | None = None
     upright: bool = True
+    chroma_subsampling: str | None = None
 
 
 class ImageCodec(Protocol):
@@ -255,10 +257,12 @@ class Meter(Protocol):
         ...
 
     def frame(self, result: str) -> None:
-        """``result`` is corrected, left_alone, dropped or failed."""
+        """``result`` is corrected, left_alone, passed_through (its stream had no grid yet), dropped or failed."""
         ...
 
-    def estimate(self, outcome: str) -> None: ...
+    def estimate(self, outcome: str) -> None:
+        """One decision, ``corrected`` or ``left_alone``: once a picture or a stream, however many frames it took."""
+        ...
 
     def stream_opened(self) -> None: ...
 

@@ -1,0 +1,278 @@
+"""Encoded images with Pillow: libjpeg-turbo, zlib-ng and libwebp behind one interface.
+
+What is read becomes 8-bit gray8, rgb24 or rgba. 16-bit samples lose their lower half; CMYK becomes sRGB, by its ICC
+profile where it has one; palettes and transparent colours are resolved. An ICC profile is kept only if it still
+describes the samples. Of multi-page TIFFs and of animations within the limit, the first picture is read.
+"""
+
+from __future__ import annotations
+
+import io
+import threading
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from PIL import Image, ImageCms, ImageFile
+from PIL.BmpImagePlugin import BmpImageFile
+from PIL.JpegImagePlugin import JpegImageFile, get_sampling
+from PIL.PngImagePlugin import PngImageFile
+from PIL.TiffImagePlugin import TiffImageFile
+from PIL.WebPImagePlugin import WebPImageFile
+
+from unbend_service.adapters.codecs import exif
+from unbend_service.adapters.codecs.signatures import sniff, webp_size
+from unbend_service.application.ports import Bytes, DecodedImage, ImageHeader
+from unbend_service.domain.errors import InvalidFrame, InvalidImage, InvalidOption, TooManyPixels, UnbendError
+from unbend_service.domain.frames import Frame, PixelFormat
+
+WRITTEN_FORMATS = ("jpeg", "png", "webp")
+
+# Opened by class: Image.open would try other plugins and apply its own, global, pixel limit.
+_OPENERS: dict[str, type[ImageFile.ImageFile]] = {
+    "jpeg": JpegImageFile,
+    "png": PngImageFile,
+    "webp": WebPImageFile,
+    "tiff": TiffImageFile,
+    "bmp": BmpImageFile,
+}
+_UPRIGHT = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+_PIXEL_FORMATS = {"L": PixelFormat.GRAY8, "RGB": PixelFormat.RGB24, "RGBA": PixelFormat.RGBA}
+_RAW_MODES = {
+    PixelFormat.GRAY8: ("L", "L"),
+    PixelFormat.RGB24: ("RGB", "RGB"),
+    PixelFormat.BGR24: ("RGB", "BGR"),
+    PixelFormat.RGBA: ("RGBA", "RGBA"),
+    PixelFormat.BGRA: ("RGBA", "BGRA"),
+}
+_PROFILE_SPACES = {"L": b"GRAY", "RGB": b"RGB ", "RGBA": b"RGB "}
+_LONGEST_SIDE_PX = {"jpeg": 65_500, "png": 2**31 - 1, "webp": 16_383}
+_MAX_JPEG_EXIF_BYTES = 65_533 - 6
+# A reduced decode averages over whole blocks, and the padding of the last block shows in a picture that is only thin.
+_SHORTEST_DRAFT_PX = 64
+_WHITE = (255, 255, 255)
+
+
+@dataclass(frozen=True, slots=True)
+class PillowCodec:
+    """Port ImageCodec.
+
+    Args:
+        source_pixels: most pixels of an image that is decoded.
+        animation_frames: most frames of an animated image.
+    """
+
+    source_pixels: int
+    animation_frames: int = 1
+
+    def probe(self, body: bytes) -> ImageHeader:
+        """Reads the header only; raises EmptyBody, UnsupportedMediaType, InvalidImage, TooManyPixels."""
+        image_format = sniff(body)
+        image = self._open(body, image_format)
+        return ImageHeader(image_format, image.width, image.height, _has_alpha(image))
+
+    def decode(self, body: bytes) -> DecodedImage:
+        """Raises as :meth:`probe`, and InvalidImage for a broken body."""
+        image_format = sniff(body)
+        image = self._open(body, image_format)
+        with _translated(image_format):
+            image.load()
+            # TIFF is turned upright by its plugin, and its EXIF block is the file itself
+            block = exif.bare(image.info.get("exif") or b"") if image_format != "tiff" else b""
+            method = _UPRIGHT.get(exif.orientation(block))
+            profile = image.info.get("icc_profile") or None
+            plain = _plain(image, profile)
+            if method is not None:
+                plain = plain.transpose(method)
+            frame = Frame(_PIXEL_FORMATS[plain.mode], plain.width, plain.height, np.asarray(plain).reshape(-1))
+        return DecodedImage(
+            frame,
+            image_format,
+            exif=(exif.upright(block) if block else None),
+            icc_profile=profile if _describes(profile, plain.mode) else None,
+            upright=method is None,
+            chroma_subsampling=_subsampling(image),
+        )
+
+    def decode_grey(self, body: bytes, longest_px: int) -> Bytes:
+        """(height, width) uint8, upright, its longer side ``longest_px`` at most; raises as :meth:`decode`.
+
+        A JPEG is decoded at the scale n/8 just above that, which costs a fraction of a full decode.
+        """
+        image_format = sniff(body)
+        image = self._open(body, image_format)
+        with _translated(image_format):
+            share = min(1.0, longest_px / max(image.size))
+            if image_format == "jpeg" and min(image.size) >= _SHORTEST_DRAFT_PX:
+                image.draft("L", (max(1, round(image.width * share)), max(1, round(image.height * share))))
+            image.load()
+            block = exif.bare(image.info.get("exif") or b"") if image_format != "tiff" else b""
+            method = _UPRIGHT.get(exif.orientation(block))
+            plain = _flat(_plain(image, None)).convert("L")
+            grey: Bytes = np.asarray(plain if method is None else plain.transpose(method))
+        height, width = grey.shape
+        share = longest_px / max(width, height)
+        if share >= 1:
+            return grey
+        size = max(1, round(width * share)), max(1, round(height * share))
+        return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+    def encode(self, image: DecodedImage, image_format: str, quality: int) -> bytes:
+        """jpeg, png or webp with the EXIF block and ICC profile of ``image``; jpeg shows alpha over white.
+
+        Raises:
+            InvalidOption: a format that is not written, a quality outside 1..100, a picture too large for the format.
+        """
+        if image_format not in WRITTEN_FORMATS:
+            raise InvalidOption(f"format={image_format!r} is not written.", allowed=", ".join(WRITTEN_FORMATS))
+        if not 1 <= quality <= 100:
+            raise InvalidOption(f"quality={quality} is out of range.", allowed="1..100")
+        if max(image.frame.width, image.frame.height) > _LONGEST_SIDE_PX[image_format]:
+            raise InvalidOption(
+                f"A picture of {image.frame.width}x{image.frame.height} pixels does not fit into {image_format}.",
+                allowed=f"{_LONGEST_SIDE_PX[image_format]} pixels a side, or png",
+            )
+        picture = _picture(image.frame)
+        if image_format == "jpeg":
+            picture = _flat(picture)
+        elif image_format == "webp" and picture.mode == "L":
+            picture = picture.convert("RGB")
+        options = _metadata(image, image_format, picture.mode) | _options(image, image_format, quality)
+        out = io.BytesIO()
+        with _translated(image_format):
+            picture.save(out, image_format, **options)
+        return out.getvalue()
+
+    def _open(self, body: bytes, image_format: str) -> ImageFile.ImageFile:
+        """Reads the header and holds it against the limits, before any pixel is allocated."""
+        if image_format == "webp":
+            self._check_size(*webp_size(body))
+        with _translated(image_format), _without_warnings():
+            image = _OPENERS[image_format](io.BytesIO(body))
+            self._check_size(*image.size)
+            frames = 1 if image_format == "tiff" else getattr(image, "n_frames", 1)
+        if frames > self.animation_frames:
+            raise InvalidImage(
+                f"The image is an animation of {frames} frames.",
+                allowed="a still image" if self.animation_frames == 1 else f"{self.animation_frames} frames",
+                setting="animation_frames",
+            )
+        return image
+
+    def _check_size(self, width: int, height: int) -> None:
+        if width < 1 or height < 1:
+            raise InvalidImage(f"The header announces {width}x{height} pixels.", allowed="at least 1x1")
+        if width * height > self.source_pixels:
+            raise TooManyPixels(
+                f"The header announces {width}x{height} = {width * height} pixels.",
+                allowed=f"{self.source_pixels} pixels",
+                setting="source_pixels",
+            )
+
+
+_FILTERS = threading.Lock()
+
+
+@contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Pillow warns of odd metadata that it then skips; the filters are global to the process, hence the lock."""
+    with _FILTERS, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+@contextmanager
+def _translated(image_format: str) -> Iterator[None]:
+    """Pillow's plugins raise nearly anything on broken input; all of it is InvalidImage here."""
+    try:
+        yield
+    except UnbendError:
+        raise
+    except Image.DecompressionBombError as error:
+        raise TooManyPixels(str(error), setting="source_pixels") from error
+    except Exception as error:
+        raise InvalidImage(f"The {image_format} image is broken or cut off: {error}") from error
+
+
+def _has_alpha(image: Image.Image) -> bool:
+    return image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info
+
+
+def _plain(image: Image.Image, profile: bytes | None) -> Image.Image:
+    """The loaded picture in mode L, RGB or RGBA."""
+    if image.mode.startswith("I;16"):
+        return Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
+    if image.mode in ("I", "F"):
+        raise InvalidImage("The image has 32-bit samples.", allowed="8 or 16 bits a sample")
+    if _has_alpha(image):
+        return image.convert("RGBA")
+    if image.mode == "CMYK" and _describes(profile, "CMYK") and profile is not None:
+        return _to_srgb(image, profile)
+    if image.mode in ("1", "L"):
+        return image.convert("L")
+    return image.convert("RGB")
+
+
+def _to_srgb(image: Image.Image, profile: bytes) -> Image.Image:
+    try:
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        converted = ImageCms.profileToProfile(image, source, ImageCms.createProfile("sRGB"), outputMode="RGB")
+    except (ImageCms.PyCMSError, OSError):  # a broken profile is as good as none
+        converted = None
+    return image.convert("RGB") if converted is None else converted
+
+
+def _describes(profile: bytes | None, mode: str) -> bool:
+    """Whether the colour space of an ICC profile (ICC.1:2022, bytes 16 to 19) is that of the samples."""
+    return profile is not None and profile[16:20] == {**_PROFILE_SPACES, "CMYK": b"CMYK"}.get(mode)
+
+
+def _flat(picture: Image.Image) -> Image.Image:
+    if picture.mode != "RGBA":
+        return picture
+    flat = Image.new("RGB", picture.size, _WHITE)
+    flat.paste(picture, mask=picture.getchannel("A"))
+    return flat
+
+
+def _picture(frame: Frame) -> Image.Image:
+    modes = _RAW_MODES.get(frame.pixel_format)
+    if modes is None:
+        raise InvalidFrame(f"{frame.pixel_format} frames are not encoded.", allowed=", ".join(_RAW_MODES))
+    mode, raw_mode = modes
+    data = np.ascontiguousarray(frame.data)
+    return Image.frombuffer(mode, (frame.width, frame.height), data, "raw", raw_mode, 0, 1)
+
+
+def _metadata(image: DecodedImage, image_format: str, mode: str) -> dict[str, bytes]:
+    metadata = {}
+    if image.icc_profile is not None and _describes(image.icc_profile, mode):
+        metadata["icc_profile"] = image.icc_profile
+    if image.exif and (image_format != "jpeg" or len(image.exif) <= _MAX_JPEG_EXIF_BYTES):
+        metadata["exif"] = b"Exif\0\0" + image.exif
+    return metadata
+
+
+def _options(image: DecodedImage, image_format: str, quality: int) -> dict[str, object]:
+    if image_format == "jpeg":
+        return {"quality": quality, "subsampling": image.chroma_subsampling or "4:2:0"}
+    if image_format == "webp":
+        return {"quality": quality, "method": 2}
+    return {"compress_level": 3}
+
+
+def _subsampling(image: Image.Image) -> str | None:
+    if not isinstance(image, JpegImageFile):
+        return None
+    return {0: "4:4:4", 1: "4:2:2", 2: "4:2:0"}.get(get_sampling(image))

@@ -1,0 +1,45 @@
+"""Which image format some bytes are, told by their first bytes alone."""
+
+from __future__ import annotations
+
+from unbend_service.domain.errors import EmptyBody, InvalidImage, UnsupportedMediaType
+
+READ_FORMATS = ("jpeg", "png", "webp", "tiff", "bmp")
+
+
+def sniff(body: bytes) -> str:
+    """The format by magic number; names and Content-Type say nothing.
+
+    Raises:
+        EmptyBody: no bytes.
+        UnsupportedMediaType: none of READ_FORMATS.
+    """
+    if not body:
+        raise EmptyBody("The body is empty; an image was expected.", allowed=", ".join(READ_FORMATS))
+    if body.startswith(b"\xff\xd8\xff"):
+        return "jpeg"
+    if body.startswith(b"\x89PNG\r\n\x1a\n"):
+        return "png"
+    if body.startswith(b"RIFF") and body[8:12] == b"WEBP":
+        return "webp"
+    if body.startswith((b"II*\0", b"MM\0*")):
+        return "tiff"
+    if body.startswith(b"BM"):
+        return "bmp"
+    raise UnsupportedMediaType("The body is not an image of a known format.", allowed=", ".join(READ_FORMATS))
+
+
+def webp_size(body: bytes) -> tuple[int, int]:
+    """(width, height) in pixels of a WebP canvas, without its decoder, which allocates the canvas when it is made.
+
+    RFC 9649, sections 2.5 to 2.7. Raises InvalidImage.
+    """
+    chunk = body[12:16]
+    if chunk == b"VP8X" and len(body) >= 30:
+        return int.from_bytes(body[24:27], "little") + 1, int.from_bytes(body[27:30], "little") + 1
+    if chunk == b"VP8L" and len(body) >= 25 and body[20] == 0x2F:
+        bits = int.from_bytes(body[21:25], "little")
+        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    if chunk == b"VP8 " and len(body) >= 30 and body[23:26] == b"\x9d\x01\x2a":
+        return int.from_bytes(body[26:28], "little") & 0x3FFF, int.from_bytes(body[28:30], "little") & 0x3FFF
+    raise InvalidImage("The webp header is broken or cut off.")
