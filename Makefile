@@ -45,3 +45,10 @@ proto: setup-dev  ## Generate client/unbend/v1 from proto/
 	$(BIN)/python proto/generate.py
 
 .PHONY: help setup setup-dev serve test check proto
+
+PHOTOS ?= ../shared/photos
+
+parity: setup-dev  ## Compare the pictures of both renderers on ten photographs of PHOTOS
+	$(BIN)/python -m benchmarks parity --photos $(PHOTOS) --limit 10
+
+.PHONY: parity

@@ -1,0 +1,1 @@
+"""Measurements of Unbend against named peers, in the same run."""
