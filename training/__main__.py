@@ -1,0 +1,136 @@
+"""`python -m training VERB`: store, train, cooldown, plot, export, evaluate, smoke."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable
+from itertools import chain
+from pathlib import Path
+
+DEFAULT_DIRECTORY = Path.home() / ".cache" / "unbend" / "training"
+DEFAULT_PHOTOS = Path("../shared/photos")
+MALLOC = {
+    # glibc's defaults return every large tensor to the system and fault it in again: half of the time was lost there.
+    "MALLOC_MMAP_THRESHOLD_": "33554432",
+    "MALLOC_TRIM_THRESHOLD_": "2000000000",
+    "MALLOC_TOP_PAD_": "67108864",
+    "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1",
+}
+
+
+def main() -> None:
+    arguments = _parser().parse_args()
+    if sys.platform == "linux" and any(os.environ.get(name) != value for name, value in MALLOC.items()):
+        # Read by the allocator at start-up only, hence the new start.
+        threads = {"OMP_NUM_THREADS": str(arguments.threads), "OPENBLAS_NUM_THREADS": str(arguments.threads)}
+        os.execve(
+            sys.executable, [sys.executable, "-m", "training", *sys.argv[1:]], {**os.environ, **MALLOC, **threads}
+        )
+    import cv2
+    import torch
+
+    cv2.setNumThreads(arguments.threads)
+    torch.set_num_threads(arguments.threads)
+    verb: Callable[[argparse.Namespace], None] = arguments.verb
+    verb(arguments)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m training", description=__doc__)
+    parser.add_argument("--directory", type=Path, default=DEFAULT_DIRECTORY, help="checkpoints, store, logs")
+    parser.add_argument("--photos", type=Path, default=DEFAULT_PHOTOS, help="photographs with their index.csv")
+    parser.add_argument("--threads", type=int, default=1)
+    verbs = parser.add_subparsers(required=True)
+
+    store = verbs.add_parser("store", help="extract the chains of all training pictures, once")
+    store.add_argument("--scenes", type=int, default=900, help="drawn scenes to add")
+    store.add_argument("--free-only", action="store_true", help="drawn scenes and CC0 photographs only")
+    store.set_defaults(verb=_store)
+
+    train = verbs.add_parser("train", help="start the long run, or go on with it")
+    train.add_argument("--name", default="run")
+    train.add_argument("--minutes", type=float)
+    train.add_argument("--steps", type=int)
+    train.add_argument("--seed", type=int, default=0)
+    train.add_argument("--learning-rate", type=float)
+    train.add_argument("--inherit", type=Path, help="research checkpoint to begin with")
+    train.set_defaults(verb=_train)
+
+    cooldown = verbs.add_parser("cooldown", help="bring a copy of the run to rest; the run itself stays as it is")
+    cooldown.add_argument("--name", default="run")
+    cooldown.add_argument("--minutes", type=float, default=15)
+    cooldown.add_argument("--steps", type=int)
+    cooldown.set_defaults(verb=_cooldown)
+
+    plot = verbs.add_parser("plot", help="draw the training curve")
+    plot.add_argument("--name", default="run")
+    plot.set_defaults(verb=_plot)
+    return parser
+
+
+def _store(arguments: argparse.Namespace) -> None:
+    from training.chain_store import FREE_SOURCES, build_store, drawn_scenes, training_photographs
+
+    sources = FREE_SOURCES if arguments.free_only else None
+    pictures = chain(training_photographs(arguments.photos, sources), drawn_scenes(arguments.scenes, seed=1))
+    store = build_store(pictures)
+    store.save(arguments.directory / "chains.npz")
+    print(f"{store.pictures} pictures, {len(store.x)} points -> {arguments.directory / 'chains.npz'}")
+
+
+def _train(arguments: argparse.Namespace) -> None:
+    from training.chain_store import ChainStore
+    from training.checkpoints import Checkpoint
+    from training.loop import Recipe, Run, default_shape, new_checkpoint, train
+    from training.sampler import Sampler
+
+    directory: Path = arguments.directory
+    directory.mkdir(parents=True, exist_ok=True)
+    (directory / "train.pid").write_text(str(os.getpid()))
+    sampler = Sampler(ChainStore.load(directory / "chains.npz"))
+    path = directory / f"{arguments.name}.pt"
+    if path.exists():
+        checkpoint = Checkpoint.load(path)
+    else:
+        checkpoint = new_checkpoint(sampler, default_shape(), arguments.seed, arguments.inherit)
+    recipe = Recipe() if arguments.learning_rate is None else Recipe(learning_rate=arguments.learning_rate)
+    train(
+        Run(checkpoint, recipe),
+        sampler,
+        directory,
+        name=arguments.name,
+        minutes=arguments.minutes,
+        steps=arguments.steps,
+    )
+
+
+def _cooldown(arguments: argparse.Namespace) -> None:
+    from training.chain_store import ChainStore
+    from training.checkpoints import Checkpoint
+    from training.loop import Recipe, Run, train
+    from training.sampler import Sampler
+
+    directory: Path = arguments.directory
+    run = Run(Checkpoint.load(directory / f"{arguments.name}.pt"), Recipe(warmup_steps=0))
+    train(
+        run,
+        Sampler(ChainStore.load(directory / "chains.npz")),
+        directory,
+        name=f"{arguments.name}-cooled",
+        minutes=arguments.minutes if arguments.steps is None else None,
+        steps=arguments.steps,
+        cooling=True,
+    )
+
+
+def _plot(arguments: argparse.Namespace) -> None:
+    from training.curve import plot_curve
+
+    directory: Path = arguments.directory
+    plot_curve(directory / f"{arguments.name}.jsonl", directory / f"{arguments.name}.png")
+
+
+if __name__ == "__main__":
+    main()
