@@ -23,6 +23,7 @@ The tree (each leaf has a stable ``code``, which both transports put on the wire
     │   └── TooManyStreams
     ├── Unavailable
     │   ├── Draining
+    │   ├── GridStoreUnavailable
     │   ├── ModelUnavailable
     │   └── RendererUnavailable
     ├── RenderFailed
@@ -193,6 +194,12 @@ class Draining(Unavailable):
     """The service is shutting down and accepts nothing new."""
 
     code = "draining"
+
+
+class GridStoreUnavailable(Unavailable):
+    """The grid store cannot be read or written: a broken file, a full disk."""
+
+    code = "grid_store_unavailable"
 
 
 class ModelUnavailable(Unavailable):

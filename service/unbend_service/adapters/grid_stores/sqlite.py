@@ -1,0 +1,183 @@
+"""Grids kept in one SQLite file: they survive restarts, and processes of one machine may share them."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import sqlite3
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
+
+import numpy as np
+import orjson
+
+from unbend_service.domain.errors import GridNotFound, GridStoreUnavailable, InvalidInput
+from unbend_service.domain.grid import Grid
+from unbend_service.domain.records import GridRecord
+from unbend_service.settings import Settings
+
+R = TypeVar("R")
+
+SCHEMA_VERSION = 1
+_SCHEMA = """
+CREATE TABLE grids (
+    id TEXT PRIMARY KEY,
+    rows INTEGER NOT NULL,
+    columns INTEGER NOT NULL,
+    source BLOB NOT NULL,      -- little-endian float32, (rows, columns, 2)
+    provenance BLOB NOT NULL,  -- JSON of the record without its grid
+    used_at REAL NOT NULL      -- seconds since the epoch
+) WITHOUT ROWID;
+CREATE INDEX grids_used_at ON grids (used_at);
+CREATE TABLE streams (id TEXT PRIMARY KEY, grid_id TEXT NOT NULL, used_at REAL NOT NULL) WITHOUT ROWID;
+CREATE INDEX streams_used_at ON streams (used_at);
+"""
+_TABLES = ("grids", "streams")
+_BUSY_TIMEOUT_S = 5.0
+
+
+class SqliteGridStore:
+    """Port GridStore; one connection, used by one thread of its own.
+
+    Args:
+        settings: ``grid_store_path``; ``grid_store_entries`` bounds grids and stream bindings each,
+            ``grid_store_ttl_s`` counts from the last use.
+        clock: seconds since the epoch, for they outlive the process.
+
+    Raises:
+        GridStoreUnavailable: the file cannot be opened or is of another make. Every call raises it as well when the
+            file or its disk fails.
+    """
+
+    def __init__(self, settings: Settings, clock: Callable[[], float] = time.time) -> None:
+        self._path = settings.grid_store_path
+        self._entries = settings.grid_store_entries
+        self._ttl_s = settings.grid_store_ttl_s
+        self._clock = clock
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="unbend-grid-store")
+        self._connection = self._open()
+
+    async def put(self, record: GridRecord) -> None:
+        await self._run(self._put, record)
+
+    async def get(self, grid_id: str) -> GridRecord:
+        """Raises GridNotFound."""
+        return await self._run(self._get, grid_id)
+
+    async def delete(self, grid_id: str) -> None:
+        """Raises GridNotFound."""
+        await self._run(self._delete, grid_id)
+
+    async def bind_stream(self, stream_id: str, grid_id: str) -> None:
+        await self._run(self._bind_stream, stream_id, grid_id)
+
+    async def stream_grid(self, stream_id: str) -> str | None:
+        """The grid id that was bound; None if there is none, or its grid is gone."""
+        return await self._run(self._stream_grid, stream_id)
+
+    async def close(self) -> None:
+        await asyncio.get_running_loop().run_in_executor(self._thread, self._connection.close)
+        self._thread.shutdown(wait=False)
+
+    def _open(self) -> sqlite3.Connection:
+        try:
+            connection = sqlite3.connect(self._path, timeout=_BUSY_TIMEOUT_S, check_same_thread=False)
+        except sqlite3.Error as error:
+            raise self._failed(error) from error
+        try:
+            connection.execute("PRAGMA journal_mode = WAL")
+            connection.execute("PRAGMA synchronous = NORMAL")
+            connection.isolation_level = None
+            connection.execute("BEGIN IMMEDIATE")
+            (version,) = connection.execute("PRAGMA user_version").fetchone()
+            if version == 0:
+                for statement in filter(str.strip, _SCHEMA.split(";\n")):
+                    connection.execute(statement)
+                connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+                version = SCHEMA_VERSION
+            connection.execute("COMMIT")
+        except sqlite3.Error as error:
+            connection.close()
+            raise self._failed(error) from error
+        if version != SCHEMA_VERSION:
+            connection.close()
+            raise GridStoreUnavailable(
+                f"The grid store {self._path} has version {version}.",
+                allowed=f"version {SCHEMA_VERSION}, or a new file",
+                setting="grid_store_path",
+            )
+        return connection
+
+    async def _run(self, function: Callable[..., R], *args: Any) -> R:
+        return await asyncio.get_running_loop().run_in_executor(self._thread, self._transaction, function, args)
+
+    def _transaction(self, function: Callable[..., R], args: tuple[Any, ...]) -> R:
+        try:
+            self._connection.execute("BEGIN IMMEDIATE")
+            try:
+                self._forget()
+                result = function(*args)
+            except BaseException:
+                if self._connection.in_transaction:
+                    self._connection.execute("ROLLBACK")
+                raise
+            self._connection.execute("COMMIT")
+        except sqlite3.Error as error:
+            raise self._failed(error) from error
+        return result
+
+    def _failed(self, error: sqlite3.Error) -> GridStoreUnavailable:
+        return GridStoreUnavailable(f"The grid store failed: {error}.", setting="grid_store_path")
+
+    def _put(self, record: GridRecord) -> None:
+        provenance = record.to_dict()
+        del provenance["grid"]
+        grid = record.grid
+        row = (record.id, grid.rows, grid.columns, grid.source.astype("<f4").tobytes(), orjson.dumps(provenance))
+        self._connection.execute("INSERT OR REPLACE INTO grids VALUES (?, ?, ?, ?, ?, ?)", (*row, self._clock()))
+        self._bound("grids")
+
+    def _get(self, grid_id: str) -> GridRecord:
+        query = "UPDATE grids SET used_at = ? WHERE id = ? RETURNING rows, columns, source, provenance"
+        found = self._connection.execute(query, (self._clock(), grid_id)).fetchall()
+        if not found:
+            raise GridNotFound(f"No grid is stored as {grid_id!r}.")
+        rows, columns, source, provenance = found[0]
+        try:
+            grid = Grid(np.frombuffer(source, dtype="<f4").reshape(rows, columns, 2))
+            stand_in = Grid.identity(2, 2).to_dict()
+            record = GridRecord.from_dict({**orjson.loads(provenance), "grid": stand_in})
+        except (InvalidInput, ValueError) as error:
+            raise GridStoreUnavailable(f"The stored grid {grid_id} is damaged.", setting="grid_store_path") from error
+        return dataclasses.replace(record, grid=grid)
+
+    def _delete(self, grid_id: str) -> None:
+        if not self._connection.execute("DELETE FROM grids WHERE id = ?", (grid_id,)).rowcount:
+            raise GridNotFound(f"No grid is stored as {grid_id!r}.")
+
+    def _bind_stream(self, stream_id: str, grid_id: str) -> None:
+        row = (stream_id, grid_id, self._clock())
+        self._connection.execute("INSERT OR REPLACE INTO streams VALUES (?, ?, ?)", row)
+        self._bound("streams")
+
+    def _stream_grid(self, stream_id: str) -> str | None:
+        now = self._clock()
+        query = "UPDATE streams SET used_at = ? WHERE id = ? RETURNING grid_id"
+        found = self._connection.execute(query, (now, stream_id)).fetchall()
+        if not found:
+            return None
+        grid_id: str = found[0][0]
+        kept = self._connection.execute("UPDATE grids SET used_at = ? WHERE id = ?", (now, grid_id)).rowcount
+        return grid_id if kept else None
+
+    def _forget(self) -> None:
+        for table in _TABLES:
+            self._connection.execute(f"DELETE FROM {table} WHERE used_at < ?", (self._clock() - self._ttl_s,))
+
+    def _bound(self, table: str) -> None:
+        (count,) = self._connection.execute(f"SELECT count(*) FROM {table}").fetchone()
+        if count > self._entries:
+            query = f"DELETE FROM {table} WHERE id IN (SELECT id FROM {table} ORDER BY used_at LIMIT ?)"
+            self._connection.execute(query, (count - self._entries,))
