@@ -22,8 +22,9 @@ from unbend_service.domain.errors import (
     UnsupportedMediaType,
 )
 from unbend_service.domain.frames import Frame, PixelFormat, frame_size_bytes
+from unbend_service.settings import Settings
 
-CODEC = PillowCodec(source_pixels=100_000_000, animation_frames=1)
+CODEC = PillowCodec(Settings(source_pixels=100_000_000, animation_frames=1))
 ORIENTATION = 0x0112
 TRANSPOSED = {
     1: None,
@@ -309,9 +310,9 @@ def test_a_bomb_is_refused_by_its_header(image_format: str) -> None:
 
 def test_the_pixel_limit_is_the_setting() -> None:
     """The limit is the setting's, to the pixel."""
-    assert PillowCodec(source_pixels=96 * 64).decode(encoded(picture(), "png")).frame.width == 96
+    assert PillowCodec(Settings(source_pixels=96 * 64)).decode(encoded(picture(), "png")).frame.width == 96
     with pytest.raises(TooManyPixels):
-        PillowCodec(source_pixels=96 * 64 - 1).decode(encoded(picture(), "png"))
+        PillowCodec(Settings(source_pixels=96 * 64 - 1)).decode(encoded(picture(), "png"))
 
 
 @pytest.mark.parametrize("image_format", ["png", "webp"])
@@ -319,10 +320,10 @@ def test_animations_are_refused_beyond_the_limit(image_format: str) -> None:
     """An animation is refused with what is accepted and the setting; within the limit its first frame is read."""
     with pytest.raises(InvalidImage, match=r"animation of 2 frames.*a still image.*animation_frames"):
         CODEC.probe(animation(image_format))
-    image = PillowCodec(1_000_000, animation_frames=2).decode(animation(image_format))
+    image = PillowCodec(Settings(animation_frames=2)).decode(animation(image_format))
     assert difference(image, picture()) < 3
     with pytest.raises(InvalidImage, match=r"3 frames.*2 frames"):
-        PillowCodec(1_000_000, animation_frames=2).probe(animation(image_format, 3))
+        PillowCodec(Settings(animation_frames=2)).probe(animation(image_format, 3))
 
 
 def test_the_first_page_of_a_tiff_is_read() -> None:

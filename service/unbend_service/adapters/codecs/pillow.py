@@ -12,7 +12,6 @@ import threading
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -28,6 +27,7 @@ from unbend_service.adapters.codecs.signatures import sniff, webp_size
 from unbend_service.application.ports import Bytes, DecodedImage, ImageHeader
 from unbend_service.domain.errors import InvalidFrame, InvalidImage, InvalidOption, TooManyPixels, UnbendError
 from unbend_service.domain.frames import Frame, PixelFormat
+from unbend_service.settings import Settings
 
 WRITTEN_FORMATS = ("jpeg", "png", "webp")
 
@@ -64,17 +64,16 @@ _SHORTEST_DRAFT_PX = 64
 _WHITE = (255, 255, 255)
 
 
-@dataclass(frozen=True, slots=True)
 class PillowCodec:
     """Port ImageCodec.
 
     Args:
-        source_pixels: most pixels of an image that is decoded.
-        animation_frames: most frames of an animated image.
+        settings: ``source_pixels`` and ``animation_frames`` bound what is decoded.
     """
 
-    source_pixels: int
-    animation_frames: int = 1
+    def __init__(self, settings: Settings) -> None:
+        self.source_pixels = settings.source_pixels
+        self.animation_frames = settings.animation_frames
 
     def probe(self, body: bytes) -> ImageHeader:
         """Reads the header only; raises EmptyBody, UnsupportedMediaType, InvalidImage, TooManyPixels."""
