@@ -52,3 +52,8 @@ parity: setup-dev  ## Compare the pictures of both renderers on ten photographs 
 	$(BIN)/python -m benchmarks parity --photos $(PHOTOS) --limit 10
 
 .PHONY: parity
+
+docs: setup-dev  ## Write the configuration table of the README
+	$(BIN)/python docs/settings.py
+
+.PHONY: docs

@@ -49,9 +49,7 @@ async def _compare(photographs: list[Path]) -> float:
             info = service.pool.state().renderer
             print(f"renderer {info.name if info else None}: {info.device if info else None}")
         for path in photographs:
-            figures = []
-            for fit in (CROP, FULL):
-                figures.append(await _psnr_db(path.read_bytes(), fit, egl, cpu))
+            figures = [await _psnr_db(path.read_bytes(), fit, egl, cpu) for fit in (CROP, FULL)]
             print(f"{path.parent.name}/{path.name}: crop {figures[0]:.1f} dB, full {figures[1]:.1f} dB", flush=True)
             worst = min(worst, *figures)
     return worst

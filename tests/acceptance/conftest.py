@@ -1,0 +1,101 @@
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import psutil
+import pytest
+
+
+@dataclass
+class Server:
+    """A real ``unbend serve`` on free ports.
+
+    Attributes:
+        http, grpc: host:port.
+        lines: what it has logged so far, parsed.
+    """
+
+    process: subprocess.Popen[str]
+    lines: list[dict[str, object]] = field(default_factory=list)
+    http: str = ""
+    grpc: str = ""
+
+    def metric(self, name: str, **labels: str) -> float:
+        """Sum of the samples of one metric whose labels contain ``labels``."""
+        total = 0.0
+        for line in self.get("/metrics").decode().splitlines():
+            head, _, value = line.rpartition(" ")
+            if head.split("{")[0] == name and all(f'{key}="{text}"' in head for key, text in labels.items()):
+                total += float(value)
+        return total
+
+    def get(self, path: str) -> bytes:
+        with urllib.request.urlopen(f"http://{self.http}{path}", timeout=30) as answer:
+            return bytes(answer.read())
+
+    def workers(self) -> list[psutil.Process]:
+        """The render worker processes."""
+        pids = {worker["pid"] for worker in json.loads(self.get("/readyz"))["workers"]}
+        return [child for child in psutil.Process(self.process.pid).children(recursive=True) if child.pid in pids]
+
+
+def start_server(**settings: str) -> Server:
+    """Starts ``unbend serve`` and waits until it says that it is ready."""
+    environment = os.environ | {
+        "UNBEND_HTTP_PORT": "0",
+        "UNBEND_GRPC_PORT": "0",
+        "UNBEND_LOG_FORMAT": "json",
+        **{f"UNBEND_{name.upper()}": value for name, value in settings.items()},
+    }
+    process = subprocess.Popen(
+        [sys.executable, "-m", "unbend", "serve"], env=environment, stderr=subprocess.PIPE, text=True
+    )
+    server = Server(process)
+    ready = threading.Event()
+
+    def read() -> None:
+        assert process.stderr is not None
+        for line in process.stderr:
+            entry = json.loads(line) if line.startswith("{") else {"event": line}
+            server.lines.append(entry)
+            if entry["event"] == "ready":
+                server.http, server.grpc = str(entry["http"]), str(entry["grpc"])
+                ready.set()
+
+    threading.Thread(target=read, daemon=True).start()
+    deadline = time.monotonic() + 60
+    while not ready.wait(0.1):
+        if process.poll() is not None or time.monotonic() > deadline:
+            process.kill()
+            raise AssertionError(f"the service did not start: {server.lines}")
+    return server
+
+
+def stop_server(server: Server) -> int:
+    """Asks the service to stop and returns its exit status."""
+    if server.process.poll() is None:
+        server.process.send_signal(signal.SIGTERM)
+    try:
+        return server.process.wait(30)
+    finally:
+        server.process.kill()
+        if server.process.stderr is not None:
+            server.process.stderr.close()
+        server.process.wait(5)
+
+
+@pytest.fixture(scope="session")
+def server() -> Iterator[Server]:
+    """One service for every test that does not need its own."""
+    running = start_server()
+    yield running
+    assert stop_server(running) == 0
