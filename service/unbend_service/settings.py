@@ -47,6 +47,12 @@ class Settings(BaseSettings):
     stream_estimate_frames: int = Field(
         5, ge=1, le=64, description="Frames that the grid of a stream is estimated over, unless the stream says."
     )
+    stream_estimate_wait_s: float = Field(
+        1.0, gt=0, description="The grid of a stream is estimated over fewer frames if none came for so long."
+    )
+    grpc_message_bytes: int = Field(
+        160 << 20, ge=1 << 20, description="Largest gRPC message; a raw 7680x4320 rgba frame takes 127 MiB."
+    )
 
     grid_store: Literal["memory", "sqlite"] = Field("memory", description="Where grids are kept.")
     grid_store_path: Path = Field(Path("unbend-grids.sqlite3"), description="File of the sqlite grid store.")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from unbend_service.domain.errors import Draining
@@ -17,6 +17,11 @@ class Admission:
         self._draining = False
         self._idle = asyncio.Event()
         self._idle.set()
+        self._listeners: list[Callable[[], None]] = []
+
+    def on_drain(self, listener: Callable[[], None]) -> None:
+        """Calls ``listener`` when draining begins, for calls that would not end by themselves."""
+        self._listeners.append(listener)
 
     @property
     def draining(self) -> bool:
@@ -43,7 +48,10 @@ class Admission:
 
     async def drain(self, grace_s: float) -> bool:
         """Refuses new calls and waits for those under way; False if some are left after ``grace_s`` seconds."""
-        self._draining = True
+        if not self._draining:
+            self._draining = True
+            for listener in self._listeners:
+                listener()
         try:
             await asyncio.wait_for(self._idle.wait(), grace_s)
         except TimeoutError:

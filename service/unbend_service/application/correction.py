@@ -8,10 +8,11 @@ from unbend_service.application.blocking import BlockingWork
 from unbend_service.application.estimation import ESTIMATE_LONGEST_PX, Estimation
 from unbend_service.application.fitting import FittedGrids
 from unbend_service.application.grey import grey_of_frame
-from unbend_service.application.ports import Bytes, GridStore, ImageCodec, Meter, RenderPool
+from unbend_service.application.ports import Bytes, DecodedImage, GridStore, ImageCodec, Meter, RenderPool
 from unbend_service.domain.errors import InvalidOption, UnbendError
 from unbend_service.domain.fit import CROP, Fit
 from unbend_service.domain.frames import BLACK, Border, Frame
+from unbend_service.domain.grid import Grid
 from unbend_service.domain.records import Correct, GridRecord, Outcome
 
 WRITTEN_FORMATS = ("jpeg", "png", "webp")
@@ -103,10 +104,7 @@ class Correction:
             self._meter.frame("left_alone")
             return CorrectedImage(body, image_format, record)
         frame = await self.render(image.frame, record, options)
-        quality = self._jpeg_quality if options.quality is None else options.quality
-        encoded = await self._blocking.run(
-            "encode", self._codec.encode, replace(image, frame=frame), image_format, quality
-        )
+        encoded = await self.encode(replace(image, frame=frame), image_format, options)
         return CorrectedImage(encoded, image_format, record)
 
     async def of_frame(self, frame: Frame, options: CorrectOptions) -> CorrectedFrame:
@@ -122,15 +120,34 @@ class Correction:
             self._meter.frame("left_alone")
             return frame
         try:
-            grid = await self._grids.get(record.grid, options.fit, options.strength)
-            data: Bytes = await self._pool.render(
-                frame, grid, options.border, affinity=affinity, deadline_s=self._deadline_s
-            )
+            data = await self.draw(frame, await self.fitted(record, options), options.border, affinity=affinity)
         except UnbendError:
             self._meter.frame("failed")
             raise
         self._meter.frame("corrected")
         return replace(frame, data=data)
+
+    async def fitted(self, record: GridRecord, options: CorrectOptions) -> Grid:
+        """The grid of a record as it is rendered: with strength and fit.
+
+        Raises:
+            InvalidOption, InvalidGrid, FoldedGrid.
+        """
+        return await self._grids.get(record.grid, options.fit, options.strength)
+
+    async def draw(self, frame: Frame, grid: Grid, border: Border, *, affinity: str | None = None) -> Bytes:
+        """The picture of a fitted grid, (frame_size_bytes,) uint8; counts nothing, so that it may be tried again."""
+        return await self._pool.render(frame, grid, border, affinity=affinity, deadline_s=self._deadline_s)
+
+    async def encode(self, image: DecodedImage, image_format: str, options: CorrectOptions) -> bytes:
+        """The file of a picture, jpeg, png or webp."""
+        quality = self._jpeg_quality if options.quality is None else options.quality
+        return await self._blocking.run("encode", self._codec.encode, image, image_format, quality)
+
+    @property
+    def render_workers(self) -> int:
+        """Workers that render, whatever they do now."""
+        return len(self._pool.state().workers)
 
     async def _record(self, frame: Frame, options: CorrectOptions) -> GridRecord:
         if options.grid_id is not None:
