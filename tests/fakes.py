@@ -144,3 +144,6 @@ class RecordingMeter:
 
     def model(self, model: ModelInfo) -> None:
         self.models.append(model)
+
+    def render(self) -> tuple[bytes, str]:
+        return repr(vars(self)).encode(), "text/plain"

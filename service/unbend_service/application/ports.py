@@ -247,6 +247,22 @@ class ImageCodec(Protocol):
         ...
 
 
+class Illustrator(Protocol):
+    """Draws what was estimated over the picture it was estimated from. Thread-safe; blocking."""
+
+    def guides(self, frame: Frame, guides: Guides) -> Frame:
+        """``guides``, centred source coordinates, as curves over ``frame`` -> rgb24 of the same size."""
+        ...
+
+    def grid(self, frame: Frame, grid: Grid) -> Frame:
+        """The lattice of ``grid`` (target -> source) over ``frame``, the source -> rgb24 of the same size."""
+        ...
+
+    def displacement(self, frame: Frame, grid: Grid) -> Frame:
+        """Arrows from source to target over ``frame``, with a legend in pixels -> rgb24 of the same size."""
+        ...
+
+
 class Meter(Protocol):
     """Counts what happens. Never blocks, never raises."""
 
@@ -277,3 +293,7 @@ class Meter(Protocol):
     def pool(self, state: PoolState) -> None: ...
 
     def model(self, model: ModelInfo) -> None: ...
+
+    def render(self) -> tuple[bytes, str]:
+        """Everything counted so far as text for a scraper, and its content type."""
+        ...
