@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import sys
 from collections.abc import Callable
@@ -67,6 +68,19 @@ def _parser() -> argparse.ArgumentParser:
     plot = verbs.add_parser("plot", help="draw the training curve")
     plot.add_argument("--name", default="run")
     plot.set_defaults(verb=_plot)
+
+    export = verbs.add_parser("export", help="write a checkpoint as ONNX with its card, checked against torch")
+    export.add_argument("--name", default="run-cooled")
+    export.add_argument("--weights", type=Path, default=Path("service/unbend_service/models/lineset.onnx"))
+    export.add_argument("--calibration", type=Path, help="a calibration.json written by `evaluate --calibrate`")
+    export.set_defaults(verb=_export)
+
+    evaluate = verbs.add_parser("evaluate", help="measure exported weights, or a checkpoint, on validation pictures")
+    evaluate.add_argument("--weights", type=Path, help="an exported .onnx; otherwise --name's checkpoint is exported")
+    evaluate.add_argument("--name", default="run")
+    evaluate.add_argument("--limit", type=int, default=48, help="photographs per family")
+    evaluate.add_argument("--threshold", type=float, default=0.5, help="confidence below which nothing is corrected")
+    evaluate.set_defaults(verb=_evaluate)
     return parser
 
 
@@ -130,6 +144,41 @@ def _plot(arguments: argparse.Namespace) -> None:
 
     directory: Path = arguments.directory
     plot_curve(directory / f"{arguments.name}.jsonl", directory / f"{arguments.name}.png")
+
+
+def _export(arguments: argparse.Namespace) -> None:
+    from training.checkpoints import Checkpoint
+    from training.export import UNCALIBRATED, export
+
+    confidence = UNCALIBRATED
+    if arguments.calibration is not None:
+        confidence = tuple(json.loads(arguments.calibration.read_text())["confidence"])
+    checkpoint = Checkpoint.load(arguments.directory / f"{arguments.name}.pt")
+    difference = export(checkpoint, arguments.weights, confidence=confidence)
+    print(f"{arguments.weights}: {checkpoint.samples} samples, differs from torch by {difference:.1e}")
+
+
+def _evaluate(arguments: argparse.Namespace) -> None:
+    from training.checkpoints import Checkpoint
+    from training.evaluation import measure, measure_harm, table, write
+    from training.export import export
+    from training.protocol import validation_photographs
+    from unbend_service.adapters.estimators.cards import read_card
+    from unbend_service.adapters.estimators.lineset import LinesetEstimator
+
+    directory: Path = arguments.directory / "evaluations"
+    weights: Path | None = arguments.weights
+    title = str(weights)
+    if weights is None:
+        checkpoint = Checkpoint.load(arguments.directory / f"{arguments.name}.pt")
+        title = f"{arguments.name}, {checkpoint.samples / 1e6:.2f} M samples, {checkpoint.seconds / 3600:.2f} h"
+        weights = directory / f"{arguments.name}.onnx"
+        export(checkpoint, weights)
+    estimator = LinesetEstimator(read_card(str(weights)), arguments.threads)
+    photographs = validation_photographs(arguments.photos, arguments.limit)
+    text = table(measure(estimator, photographs), measure_harm(estimator, photographs), arguments.threshold, title)
+    write(text, directory / f"{weights.stem}-{arguments.limit}.md")
+    print(text)
 
 
 if __name__ == "__main__":

@@ -18,10 +18,10 @@ import torch
 from torch import Tensor
 
 from training.checkpoints import Checkpoint
-from training.distortions import KINDS
 from training.labels import STRAIGHT, VALUES
 from training.lineset_network import LinesetNetwork, NetworkShape
 from training.losses import errors, spread_loss, tempered
+from training.random_distortions import KINDS
 from training.sampler import Sampler, TrainingBatch
 from training.warm_start import inherit
 from unbend_service.adapters.estimators.chain_features import FEATURES

@@ -14,8 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from training.chain_store import DRAWN, LEVELS, QUANTUM, ChainStore
-from training.distortions import DistortionBatch, draw_distortions, natural_tilts
+from training.distortions import DistortionBatch
+from training.homographies import natural_tilts
 from training.labels import evaluation_points, evaluation_weights, fit_labels
+from training.random_distortions import draw_distortions
 from unbend_service.adapters.estimators.chain_features import ChainDescriptions, ChainPoints, describe
 
 Float32 = npt.NDArray[np.float32]
@@ -38,7 +40,7 @@ class TrainingBatch:
 
     chains: the network's input. source, target: float32 (B, n, 2), correspondences in the isotropic frame; weight:
     float32 (B, n). slopes: float32 (B, n, 2, 2), d source / d target. labels: float32 (B, 48) fitted node values.
-    kind: int (B,) index into distortions.KINDS.
+    kind: int (B,) index into random_distortions.KINDS.
     """
 
     chains: ChainDescriptions

@@ -1,0 +1,181 @@
+"""Measuring an estimator on whole pictures, in this process: decoded picture in, guides out, as in the service.
+
+End-point errors (EPE) of the backward map are in pixels of a 256 picture, over the part of the target that the
+distorted picture shows: of everything (`all`), and up to the best target-side homography (`nonlinear`), which asks
+only that straight lines be straight. Doing nothing is measured beside every figure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from training.distortions import DistortionBatch
+from training.protocol import FAMILIES, LZSL_SIX, Bytes, cases
+from unbend_service.adapters.estimators.lineset import Evidence, LinesetEstimator
+from unbend_service.domain.decision import spin_grid
+from unbend_service.domain.guides import Guides
+from unbend_service.domain.maps import BackwardMap, target_lattice
+from unbend_service.domain.records import Correct
+
+Float64 = npt.NDArray[np.float64]
+
+PIXELS = 128.0
+_LATTICE = 25
+_FULL_LONG_SIDE_PX = 512
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One picture: errors in px at 256, of doing nothing and of the estimate."""
+
+    family: str
+    overall_nothing: float
+    overall: float
+    nonlinear_nothing: float
+    nonlinear: float
+    evidence: Evidence | None
+    confidence: float
+
+
+def measure(
+    estimator: LinesetEstimator, photographs: list[Bytes], families: Iterable[str] = FAMILIES
+) -> list[Measurement]:
+    """Every photograph under every family."""
+    measurements = []
+    for family in families:
+        for case in cases(family, photographs):
+            guides, evidence = estimator.examine(case.picture)
+            confidence = estimator.estimate(case.picture).confidence
+            target, truth = true_correspondences(case.distortion)
+            overall_nothing, nonlinear_nothing = map_errors(lambda points: points, target, truth)
+            overall, nonlinear = map_errors(guides, target, truth)
+            measurements.append(
+                Measurement(family, overall_nothing, overall, nonlinear_nothing, nonlinear, evidence, confidence)
+            )
+    return measurements
+
+
+def true_correspondences(distortion: DistortionBatch) -> tuple[Float64, Float64]:
+    """Target points whose true source lies in the picture, and that source: both (n, 2), square pictures."""
+    lattice = target_lattice(_LATTICE, _LATTICE, 1 - 1 / _LATTICE).reshape(-1, 2)
+    x, y, visible = distortion.bend(
+        lattice[:, 0].astype(np.float32), lattice[:, 1].astype(np.float32), np.zeros(len(lattice), np.int64)
+    )
+    source = np.stack([x, y], 1).astype(np.float64)
+    shown = visible & (np.abs(source) <= 1).all(1)
+    return lattice[shown], source[shown]
+
+
+def map_errors(backward: BackwardMap, target: Float64, truth: Float64) -> tuple[float, float]:
+    """Mean EPE of a backward map, px: of everything, and after the best homography of the target."""
+    missed = backward(target) - truth
+    return float(np.hypot(*missed.T).mean() * PIXELS), float(_aligned_error(backward, target, truth) * PIXELS)
+
+
+def _aligned_error(backward: BackwardMap, target: Float64, truth: Float64) -> float:
+    """Mean error after Gauss-Newton (Levenberg) on the 8 numbers of S in |backward(S(target)) - truth|^2."""
+    parameters, damping = np.zeros(8), 1e-6
+    residual, jacobian = _residual(backward, target, truth, parameters)
+    for _ in range(15):
+        normal, right = jacobian.T @ jacobian, jacobian.T @ residual.ravel()
+        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-9), -right)
+        tried, tried_jacobian = _residual(backward, target, truth, parameters + step)
+        gained = (residual**2).sum() - (tried**2).sum()
+        if gained > 0:
+            settled = gained < 1e-5 * (residual**2).sum()
+            parameters, residual, jacobian, damping = parameters + step, tried, tried_jacobian, max(damping / 5, 1e-9)
+            if settled:
+                break
+        else:
+            damping *= 10
+            if damping > 1e5:
+                break
+    return float(np.hypot(*residual.T).mean())
+
+
+def _residual(backward: BackwardMap, target: Float64, truth: Float64, p: Float64) -> tuple[Float64, Float64]:
+    """backward(S(target)) - truth (n, 2), and its derivative by the parameters (2 n, 8), x and y interleaved."""
+    s, t = target.T
+    matrix = np.array([[1 + p[0], p[1], p[2]], [p[3], 1 + p[4], p[5]], [p[6], p[7], 1.0]])
+    projected = np.stack([s, t, np.ones_like(s)], 1) @ matrix.T
+    depth = np.maximum(projected[:, 2:], 0.05)
+    moved = (projected[:, :2] / depth).clip(-3, 3)
+    step = 1e-4
+    here = backward(moved)
+    by_s = (backward(moved + np.array([step, 0])) - here) / step
+    by_t = (backward(moved + np.array([0, step])) - here) / step
+    zero, one = np.zeros_like(s), np.ones_like(s)
+    of_s = np.stack([s, t, one, zero, zero, zero, -moved[:, 0] * s, -moved[:, 0] * t], 1) / depth
+    of_t = np.stack([zero, zero, zero, s, t, one, -moved[:, 1] * s, -moved[:, 1] * t], 1) / depth
+    jacobian = by_s[:, :, None] * of_s[:, None, :] + by_t[:, :, None] * of_t[:, None, :]
+    return here - truth, jacobian.reshape(-1, 8)
+
+
+def measure_harm(estimator: LinesetEstimator, photographs: list[Bytes]) -> Float64:
+    """(n, 2): mean displacement of undistorted whole photographs by the nonlinear correction, px at 256 on the long
+    side, and the confidence."""
+    rows = []
+    for photograph in photographs:
+        scale = _FULL_LONG_SIDE_PX / max(photograph.shape[:2])
+        small = cv2.resize(photograph, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        estimate = estimator.estimate(np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.uint8))
+        rows.append((_displacement(estimate.guides, small.shape[1], small.shape[0]), estimate.confidence))
+    return np.array(rows)
+
+
+def _displacement(guides: Guides, width: int, height: int) -> float:
+    if guides.is_straight:
+        return 0.0
+    grid = spin_grid(guides, Correct.NONLINEAR, 33)
+    offset = (grid.source - target_lattice(33, 33)) * np.array([width, height]) / max(width, height)
+    return float(np.hypot(offset[..., 0], offset[..., 1]).mean() * PIXELS)
+
+
+def table(measurements: list[Measurement], harm: Float64, threshold: float, title: str) -> str:
+    """Markdown: errors by family with the do-nothing line, as estimated and as applied above the threshold."""
+    lines = [
+        f"### {title}",
+        "",
+        "| family | n | all: nothing | all | median | up to a homography: nothing | raw | median |"
+        f" applied (confidence >= {threshold:g}) | made worse | corrected |",
+        "|" + "---|" * 11,
+    ]
+    for family in dict.fromkeys(m.family for m in measurements):
+        own = [m for m in measurements if m.family == family]
+        nothing_all, overall, nothing, raw = (
+            np.array([getattr(m, name) for m in own])
+            for name in ("overall_nothing", "overall", "nonlinear_nothing", "nonlinear")
+        )
+        used = np.array([m.confidence >= threshold for m in own])
+        applied = np.where(used, raw, nothing)
+        lines.append(
+            f"| {family} | {len(own)} | {nothing_all.mean():.2f} | {overall.mean():.2f} |"
+            f" {np.median(overall):.2f} | {nothing.mean():.2f} | {raw.mean():.2f} | {np.median(raw):.2f} |"
+            f" {applied.mean():.2f} | {(applied > nothing + 0.25).mean():.2f} | {used.mean():.2f} |"
+        )
+    six = [m for m in measurements if m.family in LZSL_SIX]
+    if six:
+        means = [np.mean([[m.overall_nothing, m.overall] for m in six if m.family == f], 0) for f in LZSL_SIX]
+        nothing_mean, mean = np.mean(means, 0)
+        lines += ["", f"All, mean of six: {nothing_mean:.2f} (nothing) -> **{mean:.2f}**."]
+    if len(harm):
+        moved = np.where(harm[:, 1] >= threshold, harm[:, 0], 0.0)
+        lines += [
+            "",
+            f"Undistorted photographs (n={len(harm)}), nonlinear displacement px: raw mean {harm[:, 0].mean():.3f},"
+            f" p95 {np.percentile(harm[:, 0], 95):.2f}, below 0.5 px {(harm[:, 0] < 0.5).mean():.3f};"
+            f" applied mean {moved.mean():.3f}, p95 {np.percentile(moved, 95):.2f}, below 0.5 px"
+            f" {(moved < 0.5).mean():.3f}.",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def write(text: str, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
