@@ -5,15 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from unbend_service.domain.errors import InvalidGrid, InvalidOption
-from unbend_service.domain.grid import Grid, cell_orientations
-from unbend_service.domain.maps import BackwardMap, Float64, target_lattice
+from unbend_service.domain.grid import MAX_SOURCE, Float32, Grid, folded_share
+from unbend_service.domain.maps import Float64, target_lattice
+from unbend_service.domain.windows import Window, WindowSearch, within
 
-#: How far beyond the estimated frame the search for a window goes, in half picture widths.
-_SEARCH_EXTENT = 2.0
-_SEARCH_POINTS = 257
+#: Excess over 1 that is rounding, not a gap: 0.04 px in a picture of 8192.
+_ROUNDING = 1e-5
+#: A window smaller than this, in half picture widths, shows no picture.
+_SMALLEST_WINDOW = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,19 +50,6 @@ CROP = Fit(0.0)
 FULL = Fit(1.0)
 
 
-@dataclass(frozen=True, slots=True)
-class Window:
-    """An upright part of the target plane with the aspect of the picture: a square in centred coordinates."""
-
-    x: float
-    y: float
-    half: float
-
-    def points(self, lattice: Float64) -> Float64:
-        """Maps (..., 2) points of [-1, 1]^2 into the window."""
-        return np.asarray(lattice * self.half + np.array([self.x, self.y]))
-
-
 def check_strength(strength: float) -> float:
     """Raises InvalidOption unless 0 <= strength <= 1."""
     if not 0 <= strength <= 1:
@@ -81,113 +69,45 @@ def with_strength(grid: Grid, strength: float) -> Grid:
 def with_fit(grid: Grid, fit: Fit) -> Grid:
     """The grid of the target frame that ``fit`` asks for, of the same number of points.
 
+    ``crop``: every point of the result lies in [-1, 1]^2, and so does every point interpolated between them.
+    ``full`` and numbers: where the grid's continuation folds, as much is shown as does not.
+
     Raises:
         InvalidGrid: no part of the target shows the source.
     """
     if fit.zoom_out is None:
         return grid
     lattice = target_lattice(grid.rows, grid.columns)
-    crop = _crop_window(grid, lattice)
+    if np.array_equal(grid.source, lattice.astype(np.float32)):
+        return grid
+    search = WindowSearch(grid)
+    crop = search.crop()
+    cropped = _without_gaps(grid, crop, lattice)
     if fit.zoom_out == 0:
-        return _shrunk_until_valid(grid, crop, lattice)
-    full = _full_window(grid)
+        return cropped
+    full = search.full()
     share = fit.zoom_out
-    blended = Window(
-        crop.x + share * (full.x - crop.x),
-        crop.y + share * (full.y - crop.y),
-        crop.half + share * (full.half - crop.half),
-    )
-    return Grid(grid(blended.points(lattice)).astype(np.float32))
+    while share > 0.01:
+        fitted = _shown(grid, crop.towards(full, share), lattice)
+        if folded_share(fitted) == 0:
+            return Grid(fitted)
+        share *= 0.9
+    return cropped
 
 
-def _valid(source: Float64) -> npt.NDArray[np.bool_]:
-    return np.asarray((np.abs(source) <= 1).all(axis=-1))
+def _shown(grid: Grid, window: Window, lattice: Float64) -> Float32:
+    """Source points of a window; those just outside by rounding are put on the border, far ones are held at a bound."""
+    source = grid(window.points(lattice))
+    source = np.where((np.abs(source) > 1) & (np.abs(source) < 1 + _ROUNDING), np.sign(source), source)
+    return np.clip(source, -MAX_SOURCE, MAX_SOURCE).astype(np.float32)
 
 
-def _search_area(backward: BackwardMap) -> tuple[Float64, npt.NDArray[np.bool_]]:
-    """Lattice points of the search area and whether each shows the source, unfolded."""
-    points = target_lattice(_SEARCH_POINTS, _SEARCH_POINTS, _SEARCH_EXTENT)
-    source = backward(points)
-    orientation = cell_orientations(source)
-    middle = orientation[_SEARCH_POINTS // 4 : -_SEARCH_POINTS // 4, _SEARCH_POINTS // 4 : -_SEARCH_POINTS // 4]
-    sign = 1.0 if np.median(middle) > 0 else -1.0
-    kept = (orientation * sign > 0).all(axis=-1)
-    shown = _valid(source)
-    shown[:-1, :-1] &= kept
-    shown[1:, 1:] &= kept
-    if not shown.any():
-        raise InvalidGrid("No part of the target shows the source.")
-    return points, shown
-
-
-def _crop_window(grid: Grid, lattice: Float64) -> Window:
-    """The largest window without invalid points, found on the search lattice and then made larger by small steps."""
-    points, shown = _search_area(grid)
-    sums = np.pad(np.cumsum(np.cumsum(shown, axis=0), axis=1), ((1, 0), (1, 0)))
-
-    def places(size: int) -> npt.NDArray[np.bool_]:
-        total = sums[size:, size:] - sums[:-size, size:] - sums[size:, :-size] + sums[:-size, :-size]
-        return np.asarray(total == size * size)
-
-    low, high = 1, _SEARCH_POINTS
-    while low < high:
-        middle = (low + high + 1) // 2
-        low, high = (middle, high) if places(middle).any() else (low, middle - 1)
-    rows, columns = np.nonzero(places(low))
-    spacing = 2 * _SEARCH_EXTENT / (_SEARCH_POINTS - 1)
-    half = (low - 1) * spacing / 2
-    centres = points[rows, columns] + half
-    best = centres[np.argmin(np.hypot(centres[:, 0], centres[:, 1]))]
-    return _grown(grid, Window(float(best[0]), float(best[1]), half), lattice, spacing)
-
-
-def _grown(grid: Grid, window: Window, lattice: Float64, spacing: float) -> Window:
-    """Pattern search over the centre; at each centre the largest half extent is found by bisection.
-
-    Only the rim is looked at: where the map does not fold, the picture of a window lies inside that of its rim.
-    """
-    rim = np.concatenate([lattice[0], lattice[-1], lattice[:, 0], lattice[:, -1]])
-
-    def largest(x: float, y: float, at_least: float) -> float:
-        if not _valid(grid(Window(x, y, at_least).points(rim))).all():
-            return 0.0
-        low, high = at_least, at_least + 2 * spacing
-        for _ in range(9):
-            middle = (low + high) / 2
-            low, high = (middle, high) if _valid(grid(Window(x, y, middle).points(rim))).all() else (low, middle)
-        return low
-
-    x, y = window.x, window.y
-    half = max(largest(x, y, max(window.half - spacing, 0.0)), 1e-3)
-    step = spacing
-    for _ in range(40):
-        if step < spacing / 16:
-            break
-        candidates = [(x + dx * step, y + dy * step) for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1))]
-        tried = [(largest(cx, cy, half + 1e-5), cx, cy) for cx, cy in candidates]
-        better = max(tried)
-        if better[0] > half:
-            half, x, y = better
-        else:
-            step /= 2
-    return Window(x, y, half)
-
-
-def _shrunk_until_valid(grid: Grid, window: Window, lattice: Float64) -> Grid:
+def _without_gaps(grid: Grid, window: Window, lattice: Float64) -> Grid:
     """The rendered lattice is piecewise linear, so it shows no invalid pixel once all of its points are valid."""
     half = window.half
     for _ in range(200):
-        fitted = Grid(grid(Window(window.x, window.y, half).points(lattice)).astype(np.float32))
-        if _valid(fitted.source).all():
-            return fitted
+        source = _shown(grid, Window(window.x, window.y, half), lattice)
+        if within(source).all() and half > _SMALLEST_WINDOW:
+            return Grid(source)
         half *= 0.99
     raise InvalidGrid("No part of the target shows the source without a gap.")
-
-
-def _full_window(grid: Grid) -> Window:
-    points, shown = _search_area(grid)
-    inside = points[shown]
-    low, high = inside.min(axis=0), inside.max(axis=0)
-    spacing = 2 * _SEARCH_EXTENT / (_SEARCH_POINTS - 1)
-    centre = (low + high) / 2
-    return Window(float(centre[0]), float(centre[1]), float((high - low).max() / 2 + spacing / 2))

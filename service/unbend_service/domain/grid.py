@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from unbend_service.domain.continuation import ContinuedLattice
 from unbend_service.domain.errors import FoldedGrid, InvalidGrid
 from unbend_service.domain.maps import BackwardMap, Float64, target_lattice
 
@@ -77,7 +78,7 @@ class Grid:
         return "g" + digest.hexdigest()[:32]
 
     def __call__(self, target: Float64) -> Float64:
-        """Bilinear in each cell; outside [-1, 1] the lattice is continued quadratically.
+        """Bilinear in each cell; outside [-1, 1] the lattice is continued, see :mod:`.continuation`.
 
         Args:
             target: (..., 2) float64 centred target points.
@@ -86,22 +87,11 @@ class Grid:
             (..., 2) float64 centred source points.
         """
         target = np.asarray(target, dtype=np.float64)
-        extent = float(np.abs(target).max(initial=0))
-        lattice, margin = self._continued(extent) if extent > 1 else (self.source.astype(np.float64), 0)
-        column = (target[..., 0] + 1) / 2 * (self.columns - 1) + margin
-        row = (target[..., 1] + 1) / 2 * (self.rows - 1) + margin
-        c = np.clip(column.astype(np.intp), 0, lattice.shape[1] - 2)
-        r = np.clip(row.astype(np.intp), 0, lattice.shape[0] - 2)
-        u, v = (column - c)[..., None], (row - r)[..., None]
-        top = lattice[r, c] * (1 - u) + lattice[r, c + 1] * u
-        bottom = lattice[r + 1, c] * (1 - u) + lattice[r + 1, c + 1] * u
-        return np.asarray(top * (1 - v) + bottom * v)
+        return self.continued(float(np.abs(target).max(initial=0)))(target)
 
-    def _continued(self, extent: float) -> tuple[Float64, int]:
-        """The lattice with a margin of cells on each side, enough for +-extent."""
-        margin = int(np.ceil((extent - 1) / 2 * (max(self.rows, self.columns) - 1))) + 1
-        lattice = _continue_axis(self.source.astype(np.float64), margin)
-        return _continue_axis(lattice.transpose(1, 0, 2), margin).transpose(1, 0, 2), margin
+    def continued(self, extent: float) -> ContinuedLattice:
+        """The backward map of this grid with its continuation over [-extent, extent] worked out once."""
+        return ContinuedLattice.of(self.source, extent)
 
     @cached_property
     def displacement(self) -> float:
@@ -146,26 +136,8 @@ class Grid:
             raise InvalidGrid("source must be a list of [x, y] numbers.") from error
         if array.shape != (rows * columns, 2):
             raise InvalidGrid("source must be a list of [x, y] numbers.")
-        return cls(array.reshape(rows, columns, 2))
-
-
-def _continue_axis(lattice: Float64, margin: int) -> Float64:
-    """Adds ``margin`` rows before and after, on the parabola through three rows of the outer quarter."""
-    count = len(lattice)
-    step = max(1, (count - 1) // 8)
-    if count < 2 * step + 1:
-        distance = np.arange(1, margin + 1)[:, None, None]
-        before = lattice[0] + distance[::-1] * (lattice[0] - lattice[1])
-        after = lattice[-1] + distance * (lattice[-1] - lattice[-2])
-        return np.concatenate([before, lattice, after])
-    k = (np.arange(1, margin + 1) / step)[:, None, None]
-
-    def beyond(edge: Float64, inner: Float64, innermost: Float64) -> Float64:
-        return edge * (1 + k) * (2 + k) / 2 - inner * k * (2 + k) + innermost * k * (1 + k) / 2
-
-    before = beyond(lattice[0], lattice[step], lattice[2 * step])[::-1]
-    after = beyond(lattice[-1], lattice[-1 - step], lattice[-1 - 2 * step])
-    return np.concatenate([before, lattice, after])
+        with np.errstate(over="ignore"):  # an overflow becomes infinite and is refused as such
+            return cls(array.reshape(rows, columns, 2).astype(np.float32))
 
 
 def cell_orientations(source: npt.NDArray[Any]) -> Float64:

@@ -20,8 +20,12 @@ Float64 = npt.NDArray[np.float64]
 TRUSTED_EXTENT = 1.25
 #: Anchors of the shipped estimators: 0.05, 0.35, 0.65 and 0.95 of the way across.
 DEFAULT_ANCHORS = (-0.9, -0.3, 0.3, 0.9)
+#: Source points are not put further out than this: it is far outside every picture.
+MAX_REACH = 8.0
+#: 1 - R' C' of two curves that cross at a useful angle; 1 at right angles to the axes, 0 where they touch.
+_LEAST_CROSSING = 0.02
 _MAX_COEFFICIENT = 16.0
-_MAX_COUNT = 32
+_MAX_COUNT = 16  # evenly spaced anchors beyond that make the interpolation between them ill-conditioned
 _MAX_DEGREE = 15
 
 
@@ -78,14 +82,14 @@ class GuideFamily:
     def at(self, position: Float64) -> Float64:
         """Coefficients of the curve that is straight at target ``position`` (n,) -> (n, degree + 1).
 
-        Lagrange interpolation over the anchors, continued linearly outside +-TRUSTED_EXTENT.
+        Lagrange interpolation over the anchors, continued linearly outside +-TRUSTED_EXTENT. What is interpolated is
+        the deviation from straight guides, so that straight ones stay straight to the last bit.
         """
-        inside = np.clip(position, -TRUSTED_EXTENT, TRUSTED_EXTENT)
-        basis = lagrange_basis(self.anchors, inside)
-        outside = position - inside
-        if outside.any():
-            basis = basis + outside[:, None] * _lagrange_slope(self.anchors, inside)
-        return basis @ self.coefficients
+        deviation = self.coefficients.copy()
+        deviation[:, 0] -= self.anchors
+        curves = anchor_basis(self.anchors, position) @ deviation
+        curves[:, 0] += position
+        return np.asarray(curves)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,39 +108,71 @@ class Guides:
         """Where each target point comes from.
 
         At target (s, t) the row curve R_t and the column curve C_s are intersected, y = R_t(x) and x = C_s(y), by
-        damped Newton steps.
+        damped Newton steps. A target point beyond the last place where they meet (the corners of a picture that was
+        bent hard into a pincushion: no source point belongs there) is put further out along its ray from the middle,
+        where it shows nothing. Points far out are held at MAX_REACH.
 
         Args:
             target: (..., 2) float64, (s, t) centred target coordinates, also outside [-1, 1].
 
         Returns:
-            (..., 2) float64 (x, y), centred source coordinates.
+            (..., 2) float64 (x, y), centred source coordinates, all finite.
 
         Raises:
-            InvalidGuides: the two curves do not intersect near some point of the picture.
+            InvalidGuides: the curves stop to intersect before the edge of the source is reached.
         """
         points = np.asarray(target, dtype=np.float64).reshape(-1, 2)
+        source, met = self._intersect(points)
+        if not met.all():
+            source[~met] = self._beyond(points[~met])
+        reach = np.abs(source).max(axis=1, initial=0, keepdims=True)
+        source *= np.minimum(1, MAX_REACH / np.maximum(reach, MAX_REACH))
+        return source.reshape(np.shape(target))
+
+    def _intersect(self, points: Float64, steps: int = 24) -> tuple[Float64, npt.NDArray[np.bool_]]:
+        """(n, 2) source points of (n, 2) target points, and (n,) whether the curves do meet there.
+
+        Where they touch instead of crossing the map folds; what Newton finds behind that is another branch.
+        """
         row, column = self.rows.at(points[:, 1]), self.columns.at(points[:, 0])
         x, y = points[:, 0].copy(), points[:, 1].copy()
-        for _ in range(20):
+        for _ in range(steps):
             row_y, row_slope = _polynomial(row, x)
             column_x, column_slope = _polynomial(column, y)
             residual_x, residual_y = x - column_x, y - row_y
             determinant = 1 - row_slope * column_slope
+            met = (np.abs(residual_x) + np.abs(residual_y) < 1e-7) & (determinant > _LEAST_CROSSING)
+            if met.all():
+                break
             determinant = np.where(np.abs(determinant) < 0.05, 0.05, determinant)
             step_x = (residual_x + column_slope * residual_y) / determinant
             step_y = (row_slope * residual_x + residual_y) / determinant
-            size = np.maximum(np.abs(step_x), np.abs(step_y))
-            damping = np.minimum(1, 0.5 / np.maximum(size, 1e-12))
+            damping = np.minimum(1, 0.5 / np.maximum(np.maximum(np.abs(step_x), np.abs(step_y)), 1e-12))
             x -= damping * step_x
             y -= damping * step_y
-            if size.max(initial=0) < 1e-9:
-                break
-        residual = np.maximum(np.abs(x - _polynomial(column, y)[0]), np.abs(y - _polynomial(row, x)[0]))
-        inside = np.abs(points).max(axis=1, initial=0) <= 1
-        if (residual[inside] > 1e-4).any() or not np.isfinite(residual).all():
+        return np.stack([x, y], axis=-1), met
+
+    def _beyond(self, points: Float64) -> Float64:
+        """Source points, outside the picture, for (n, 2) target points at which the curves do not meet.
+
+        On the ray from the middle the last point where they meet is found by bisection; from there the ray goes on
+        in the direction and at the pace it had.
+        """
+        low, high = np.zeros(len(points)), np.ones(len(points))
+        last, met = self._intersect(np.zeros((1, 2)))
+        last, met = np.repeat(last, len(points), axis=0), np.repeat(met, len(points))
+        for _ in range(8):
+            share = (low + high) / 2
+            found, met_here = self._intersect(points * share[:, None], 10)
+            low, high = np.where(met_here, share, low), np.where(met_here, high, share)
+            last = np.where(met_here[:, None], found, last)
+            met |= met_here
+        inside = (np.abs(last) < 1).all(axis=1) & (np.abs(points) <= 1).all(axis=1)
+        if not met.all() or inside.any():
             raise InvalidGuides("Row and column guides do not intersect everywhere in the picture.")
-        return np.stack([x, y], axis=-1).reshape(np.shape(target))
+        before, _ = self._intersect(points * (0.9 * low)[:, None])
+        pace = (last - before) / np.maximum(0.1 * low, 1e-9)[:, None]
+        return np.asarray(last + pace * (1 - low)[:, None])
 
     def to_dict(self) -> dict[str, Any]:
         """The ``guides`` object of the API: {rows, columns: [{anchor, coefficients}]}."""
@@ -168,9 +204,24 @@ def lagrange_basis(nodes: Float64, position: Float64) -> Float64:
     return basis
 
 
-def _lagrange_slope(nodes: Float64, position: Float64) -> Float64:
-    step = 1e-5
-    return (lagrange_basis(nodes, position + step) - lagrange_basis(nodes, position - step)) / (2 * step)
+def anchor_basis(anchors: Float64, position: Float64) -> Float64:
+    """(n, K) share of each guide in the curve at target ``position`` (n,), linear outside +-TRUSTED_EXTENT."""
+    inside = np.clip(position, -TRUSTED_EXTENT, TRUSTED_EXTENT)
+    basis = lagrange_basis(anchors, inside)
+    outside = position - inside
+    if outside.any():
+        step = 1e-5
+        slope = (lagrange_basis(anchors, inside + step) - lagrange_basis(anchors, inside - step)) / (2 * step)
+        basis = basis + outside[:, None] * slope
+    return basis
+
+
+def power_basis(argument: Float64, degree: int) -> Float64:
+    """(n, degree + 1) powers of the source coordinate ``argument`` (n,), linear outside +-TRUSTED_EXTENT."""
+    inside = np.clip(argument, -TRUSTED_EXTENT, TRUSTED_EXTENT)
+    powers = np.vander(inside, degree + 1, increasing=True)
+    powers[:, 1:] += (argument - inside)[:, None] * np.arange(1, degree + 1) * powers[:, :-1]
+    return powers
 
 
 def _polynomial(coefficients: Float64, argument: Float64) -> tuple[Float64, Float64]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from unbend_service.domain.errors import InvalidGrid
 from unbend_service.domain.maps import BackwardMap, Float64, target_lattice
@@ -78,7 +77,7 @@ def without_plane_part(backward: BackwardMap) -> BackwardMap:
     matrix = plane_part(backward)
     if abs(np.linalg.det(matrix)) < 1e-6:
         raise InvalidGrid("The plane part of the map cannot be inverted.")
-    inverse: npt.NDArray[np.float64] = np.linalg.inv(matrix)
+    inverse = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
 
     def nonlinear(target: Float64) -> Float64:
         return backward(apply_homography(inverse, np.asarray(target, dtype=np.float64)))
