@@ -21,7 +21,13 @@ class Settings(BaseSettings):
 
     renderer: Literal["auto", "egl", "cpu"] = Field("auto", description="auto: EGL on a hardware GPU, else cpu.")
     require_gpu: bool = Field(False, description="Not ready on a software renderer.")
-    workers: int = Field(0, ge=0, le=256, description="Render worker processes; 0: one per usable core.")
+    egl_device: int = Field(0, ge=0, le=255, description="Which EGL device, counted as the driver lists them.")
+    workers: int = Field(
+        0, ge=0, le=256, description="Render worker processes; 0: one per usable core, at most 4 on a GPU."
+    )
+    map_cache_bytes: int = Field(
+        256 << 20, ge=1 << 20, description="Bound on the sampling maps that a worker keeps for grids and sizes in use."
+    )
     slots_per_worker: int = Field(2, ge=1, le=16, description="Frames that a worker may hold at once.")
     shared_memory_bytes: int = Field(
         1 << 30, ge=1 << 20, description="Upper bound of the shared memory for frames under way."

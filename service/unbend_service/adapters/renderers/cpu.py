@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
+from unbend_service.adapters.renderers.recent import Recent
 from unbend_service.adapters.renderers.sampling import Float32, PlaneSampling
 from unbend_service.application.ports import Bytes, RendererInfo
 from unbend_service.domain.errors import InvalidFrame, RenderFailed
@@ -17,6 +17,8 @@ from unbend_service.domain.grid import Grid
 
 #: cv2.remap keeps positions in 16 bits.
 _LONGEST_PX = 32_766
+#: Bytes of maps per sample at most: two float32 positions and a byte of mask.
+_STRIP_BYTES = 9
 #: A packed 3-channel plane up to this size goes through RGBA, which cv2.remap samples three times as fast.
 _WIDENED_BYTES = 64 << 20
 #: The border is painted from a block of so many rows, which stays in the cache of the processor.
@@ -36,41 +38,6 @@ class _Strip:
     @property
     def size_bytes(self) -> int:
         return self.map_x.nbytes + self.map_y.nbytes + (0 if self.outside is None else self.outside.nbytes)
-
-
-class MapCache:
-    """The maps used last, up to ``capacity_bytes``; those of a plane too large to be kept are made anew each time."""
-
-    def __init__(self, capacity_bytes: int) -> None:
-        self._capacity_bytes = capacity_bytes
-        self._entries: OrderedDict[tuple[str, PlaneSampling], tuple[_Strip, ...]] = OrderedDict()
-        self.size_bytes = 0
-
-    def __len__(self) -> int:
-        return len(self._entries)
-
-    def clear(self) -> None:
-        self._entries.clear()
-        self.size_bytes = 0
-
-    def strips(self, grid: Grid, sampling: PlaneSampling) -> Iterable[_Strip]:
-        key = grid.id, sampling
-        if key in self._entries:
-            self._entries.move_to_end(key)
-            return self._entries[key]
-        # 8 bytes of positions and up to one of mask
-        if 9 * sampling.width * sampling.height > self._capacity_bytes // 2:
-            return _make_strips(grid, sampling)
-        made = tuple(_make_strips(grid, sampling))
-        self._entries[key] = made
-        self.size_bytes += _total_bytes(made)
-        while self.size_bytes > self._capacity_bytes:
-            self.size_bytes -= _total_bytes(self._entries.popitem(last=False)[1])
-        return made
-
-
-def _total_bytes(strips: Iterable[_Strip]) -> int:
-    return sum(strip.size_bytes for strip in strips)
 
 
 def _make_strips(grid: Grid, sampling: PlaneSampling) -> Iterator[_Strip]:
@@ -101,7 +68,8 @@ class CpuRenderer:
     """
 
     def __init__(self, cache_bytes: int = 256 << 20) -> None:
-        self._maps = MapCache(cache_bytes)
+        self._cache_bytes = cache_bytes
+        self._maps: Recent[tuple[str, PlaneSampling], tuple[_Strip, ...]] = Recent(cache_bytes)
         self._wide: tuple[Bytes, Bytes] | None = None
 
     @property
@@ -109,7 +77,7 @@ class CpuRenderer:
         return RendererInfo("cpu", f"OpenCV {cv2.__version__} remap, {cv2.getNumThreads()} threads", hardware=False)
 
     @property
-    def map_bytes(self) -> int:
+    def kept_bytes(self) -> int:
         """Bytes of the maps that are kept now."""
         return self._maps.size_bytes
 
@@ -130,13 +98,24 @@ class CpuRenderer:
         targets = split_planes(target, source.pixel_format, source.width, source.height)
         try:
             for plane, colour, samples, drawn in zip(layout, colours, source.plane_arrays(), targets, strict=True):
-                strips = self._maps.strips(grid, PlaneSampling.of(source, plane))
+                strips = self._strips(grid, PlaneSampling.of(source, plane))
                 if plane.channels == 3 and plane.size_bytes <= _WIDENED_BYTES:
                     self._draw_widened(samples, strips, colour, drawn)
                 else:
                     _draw(samples, strips, colour, drawn)
         except cv2.error as error:
             raise RenderFailed(f"OpenCV could not render the frame: {error}") from error
+
+    def _strips(self, grid: Grid, sampling: PlaneSampling) -> Iterable[_Strip]:
+        """The maps of a plane; those of one so large that it would crowd out the others are not kept."""
+        key = grid.id, sampling
+        kept = self._maps.get(key)
+        if kept is not None:
+            return kept
+        if _STRIP_BYTES * sampling.width * sampling.height > self._cache_bytes // 2:
+            return _make_strips(grid, sampling)
+        made = tuple(_make_strips(grid, sampling))
+        return self._maps.put(key, made, sum(strip.size_bytes for strip in made))
 
     def _draw_widened(self, samples: Bytes, strips: Iterable[_Strip], colour: tuple[int, ...], drawn: Bytes) -> None:
         shape = (*samples.shape[:2], 4)

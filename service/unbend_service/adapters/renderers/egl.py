@@ -1,0 +1,209 @@
+"""EglRenderer: the mesh of the grid drawn with OpenGL, without a display."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import moderngl
+import numpy as np
+
+from unbend_service.adapters.renderers.mesh import mesh_triangles, mesh_vertices
+from unbend_service.adapters.renderers.recent import Recent
+from unbend_service.adapters.renderers.sampling import PlaneSampling
+from unbend_service.application.ports import Bytes, RendererInfo
+from unbend_service.domain.errors import InvalidFrame, RendererUnavailable, RenderFailed
+from unbend_service.domain.frames import Border, Frame, Plane, planes
+from unbend_service.domain.grid import Grid
+
+_SOFTWARE = ("llvmpipe", "softpipe", "swiftshader", "swrast")
+_GL_DITHER = 0x0BD0
+_REMEDY = (
+    "Install libegl1 and a driver (Mesa: libgl1-mesa-dri; NVIDIA in a container: NVIDIA_DRIVER_CAPABILITIES with "
+    "graphics), or set UNBEND_RENDERER=cpu"
+)
+
+# Only the displacement is interpolated and added to the exact pixel position: it is small where float32 would be
+# coarse, and zero for the identity. Row 0 of textures and framebuffers is the top row of the picture throughout, so
+# nothing is ever turned upside down.
+_VERTEX_SHADER = """
+#version 330 core
+in vec2 target;
+in vec2 displacement;
+uniform vec2 scale;
+uniform vec2 extent;
+out vec2 offset;
+void main() {
+    gl_Position = vec4((target + 1.0) * scale - 1.0, 0.0, 1.0);
+    offset = displacement * 0.5 * extent;
+}
+"""
+_FRAGMENT_SHADER = """
+#version 330 core
+in vec2 offset;
+uniform sampler2D image;
+uniform vec2 low;
+uniform vec2 high;
+uniform vec4 border;
+out vec4 colour;
+void main() {
+    vec2 position = gl_FragCoord.xy + offset;
+    bool outside = any(lessThan(position, low)) || any(greaterThan(position, high));
+    colour = outside ? border : textureLod(image, position / vec2(textureSize(image, 0)), 0.0);
+}
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class _Surface:
+    """Texture and framebuffer for planes of one size."""
+
+    texture: Any
+    framebuffer: Any
+
+    def release(self) -> None:
+        self.framebuffer.release()
+        self.texture.release()
+
+
+@dataclass(frozen=True, slots=True)
+class _Mesh:
+    vertices: Any
+    triangles: Any
+    array: Any
+
+    def release(self) -> None:
+        self.array.release()
+        self.triangles.release()
+        self.vertices.release()
+
+
+class EglRenderer:
+    """Renders with OpenGL 3.3 core on an EGL device; the only place where a context is made, one per process.
+
+    Cost of a frame: each plane is uploaded, drawn in one pass and read back; a new grid costs its mesh, a new size its
+    texture and framebuffer.
+
+    Args:
+        device: index of the EGL device, as the driver lists them.
+        cache_bytes: bound on the meshes, and on the textures and framebuffers, that are kept.
+
+    Raises:
+        RendererUnavailable: no OpenGL 3.3 context can be had, or this process has one already.
+    """
+
+    _open: ClassVar[bool] = False
+
+    def __init__(self, device: int = 0, cache_bytes: int = 256 << 20) -> None:
+        if EglRenderer._open:
+            raise RendererUnavailable("This process has an EGL renderer already; close it first.")
+        egl: dict[str, Any] = {"backend": "egl", "device_index": device}
+        try:
+            self._context = moderngl.create_context(require=330, standalone=True, **egl)
+        except Exception as error:  # the library raises plain Exception for everything that EGL may lack
+            raise RendererUnavailable(
+                f"EGL device {device} gives no OpenGL 3.3 context ({error}). {_REMEDY}.", setting="renderer"
+            ) from error
+        EglRenderer._open = True
+        self._closed = False
+        self._context.disable_direct(_GL_DITHER)
+        self._longest_px = int(
+            min(self._context.info["GL_MAX_TEXTURE_SIZE"], *self._context.info["GL_MAX_VIEWPORT_DIMS"])
+        )
+        self._program = self._context.program(vertex_shader=_VERTEX_SHADER, fragment_shader=_FRAGMENT_SHADER)
+        self._surfaces: Recent[tuple[int, int, int], _Surface] = Recent(cache_bytes, _Surface.release)
+        self._meshes: Recent[str, _Mesh] = Recent(cache_bytes, _Mesh.release)
+        self._info = self._describe()
+
+    @property
+    def info(self) -> RendererInfo:
+        return self._info
+
+    def _describe(self) -> RendererInfo:
+        device = str(self._context.info["GL_RENDERER"])
+        return RendererInfo("egl", device, hardware=not any(name in device.lower() for name in _SOFTWARE))
+
+    @property
+    def kept_bytes(self) -> int:
+        """Bytes of the meshes, textures and framebuffers that are kept now."""
+        return self._surfaces.size_bytes + self._meshes.size_bytes
+
+    def render(self, source: Frame, grid: Grid, border: Border, target: Bytes) -> None:
+        """See :class:`~unbend_service.application.ports.Renderer`.
+
+        Raises:
+            InvalidFrame: a side is longer than the device can draw.
+            RenderFailed: OpenGL reported an error.
+        """
+        if max(source.width, source.height) > self._longest_px:
+            raise InvalidFrame(
+                f"A frame of {source.width}x{source.height} pixels is too large for {self._info.device}.",
+                allowed=f"1 to {self._longest_px} pixels on a side",
+            )
+        colours = border.samples(source.pixel_format)
+        layout = planes(source.pixel_format, source.width, source.height)
+        try:
+            mesh = self._mesh(grid)
+            for plane, colour in zip(layout, colours, strict=True):
+                part = slice(plane.offset, plane.offset + plane.size_bytes)
+                sampling = PlaneSampling.of(source, plane)
+                self._draw(plane, sampling, mesh, colour, source.data[part], target[part])
+        except moderngl.Error as error:
+            raise RenderFailed(f"OpenGL could not render the frame: {error}") from error
+        if (code := self._context.error) != "GL_NO_ERROR":
+            raise RenderFailed(f"OpenGL reported {code}.")
+
+    def _draw(
+        self, plane: Plane, sampling: PlaneSampling, mesh: _Mesh, colour: tuple[int, ...], source: Bytes, target: Bytes
+    ) -> None:
+        surface = self._surface(plane)
+        surface.texture.write(source, alignment=1)
+        uniform = self._program
+        uniform["scale"] = tuple(sampling.extent / (plane.width, plane.height))
+        uniform["extent"] = tuple(sampling.extent)
+        # OpenGL counts positions from the edge of the first sample, not from its centre
+        uniform["low"] = (sampling.valid_low + 0.5,) * 2
+        uniform["high"] = tuple(high + 0.5 for high in sampling.valid_high)
+        uniform["border"] = tuple(np.array([*colour, 0, 0, 0][:4]) / 255)
+        surface.framebuffer.use()
+        surface.texture.use(0)
+        mesh.array.render(moderngl.TRIANGLES)
+        surface.framebuffer.read_into(target, components=plane.channels, alignment=1)
+
+    def _surface(self, plane: Plane) -> _Surface:
+        key = plane.width, plane.height, plane.channels
+        kept = self._surfaces.get(key)
+        if kept is not None:
+            return kept
+        size = plane.width, plane.height
+        texture = self._context.texture(size, plane.channels, alignment=1)
+        texture.filter = moderngl.LINEAR, moderngl.LINEAR
+        texture.repeat_x = texture.repeat_y = False
+        # three channels need not be drawable in OpenGL 3.3; four always are
+        drawn = self._context.renderbuffer(size, 4 if plane.channels == 3 else plane.channels)
+        try:
+            framebuffer = self._context.framebuffer([drawn])
+        finally:
+            drawn.release()
+        return self._surfaces.put(key, _Surface(texture, framebuffer), 2 * plane.size_bytes)
+
+    def _mesh(self, grid: Grid) -> _Mesh:
+        kept = self._meshes.get(grid.id)
+        if kept is not None:
+            return kept
+        points = mesh_vertices(grid)
+        corners = mesh_triangles(*points.shape[:2])
+        vertices, triangles = self._context.buffer(points), self._context.buffer(corners)
+        layout = [(vertices, "2f 2f", "target", "displacement")]
+        array = self._context.vertex_array(self._program, layout, triangles, index_element_size=4)
+        return self._meshes.put(grid.id, _Mesh(vertices, triangles, array), points.nbytes + corners.nbytes)
+
+    def close(self) -> None:
+        if self._closed:
+            return
+        self._closed = True
+        self._surfaces.clear()
+        self._meshes.clear()
+        self._program.release()
+        self._context.release()
+        EglRenderer._open = False

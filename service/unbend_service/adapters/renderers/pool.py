@@ -1,0 +1,324 @@
+"""WorkerPool: frames to worker processes and back, whatever happens to the workers."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import structlog
+
+from unbend_service.adapters.renderers.channel import Done, Failed
+from unbend_service.adapters.renderers.cores import usable_cores
+from unbend_service.adapters.renderers.jobs import Job, JobQueue, preferred_worker
+from unbend_service.adapters.renderers.selection import RendererOptions
+from unbend_service.adapters.renderers.slots import SlotPool
+from unbend_service.adapters.renderers.supervision import Supervisor
+from unbend_service.adapters.renderers.worker_process import WorkerProcess
+from unbend_service.application.ports import Bytes, Meter, PoolState
+from unbend_service.domain.errors import (
+    DeadlineExceeded,
+    Draining,
+    PoisonFrame,
+    QueueFull,
+    RendererUnavailable,
+    UnbendError,
+)
+from unbend_service.domain.frames import Border, Frame
+from unbend_service.domain.grid import Grid
+from unbend_service.settings import Settings
+
+log = structlog.get_logger(__name__)
+
+DEFAULT_FACTORY = "unbend_service.adapters.renderers.selection:open_renderer"
+#: A GPU gains little from more processes than keep it fed, and each holds a context and textures of its own.
+_WORKERS_OF_A_GPU = 4
+#: Larger copies are made off the event loop.
+_INLINE_COPY_BYTES = 256 << 10
+_METER_INTERVAL_S = 0.1
+
+
+class WorkerPool:
+    """Renders frames in worker processes; implements :class:`~unbend_service.application.ports.RenderPool`.
+
+    All of it runs on one event loop. A frame waits in the queue, is copied into shared memory when a worker can take
+    it, and stays there until it is answered, so a frame whose worker dies is given to another. Cost of a frame beyond
+    its rendering: two copies of its bytes and two short messages.
+
+    Args:
+        settings: workers, slots_per_worker, shared_memory_bytes, queue_frames, render_deadline_s, renderer,
+            require_gpu, egl_device, map_cache_bytes are used.
+        meter: told of restarts, stages and the pool's state.
+        renderer_factory: ``module:callable`` that makes the renderer, in the worker, from RendererOptions.
+    """
+
+    def __init__(self, settings: Settings, meter: Meter, *, renderer_factory: str = DEFAULT_FACTORY) -> None:
+        self._settings = settings
+        self._meter = meter
+        self._slots = SlotPool(settings.shared_memory_bytes)
+        self._queue = JobQueue()
+        self._jobs: set[Job] = set()
+        self._accepted = 0
+        self._mean_render_s = 0.05
+        self._closed = False
+        self._done_all = asyncio.Event()
+        self._meter_timer: asyncio.TimerHandle | None = None
+        self._copies = ThreadPoolExecutor(max_workers=2, thread_name_prefix="unbend-copy")
+        cores = usable_cores()
+        self._cores = cores
+        count = settings.workers or cores
+        options = RendererOptions(
+            renderer=settings.renderer,
+            require_gpu=settings.require_gpu,
+            threads=max(1, cores // count),
+            egl_device=settings.egl_device,
+            map_cache_bytes=settings.map_cache_bytes,
+        )
+        self._supervisor = Supervisor(renderer_factory, options, settings.render_deadline_s, self)
+
+    async def start(self) -> None:
+        """Starts one worker, learns from it what the renderer is, and then starts the others.
+
+        Raises:
+            RendererUnavailable: it could not be started, or a GPU is required and missing.
+        """
+        try:
+            info = await self._supervisor.start_first()
+        except BaseException:
+            await self.close(0)
+            raise
+        count = self._settings.workers or (min(self._cores, _WORKERS_OF_A_GPU) if info.hardware else self._cores)
+        log.info("renderer chosen", renderer=info.name, device=info.device, hardware=info.hardware, workers=count)
+        self._supervisor.start_others(count)
+
+    async def render(
+        self, frame: Frame, grid: Grid, border: Border, *, affinity: str | None = None, deadline_s: float | None = None
+    ) -> Bytes:
+        """See :class:`~unbend_service.application.ports.RenderPool`; ``render_deadline_s`` bounds every deadline.
+
+        Raises:
+            QueueFull, DeadlineExceeded, PoisonFrame, RenderFailed, InvalidFrame, RendererUnavailable, Draining.
+        """
+        loop = asyncio.get_running_loop()
+        limit_s = min(self._settings.render_deadline_s, math.inf if deadline_s is None else deadline_s)
+        self._check_accepting(limit_s)
+        self._accepted += 1
+        job = Job(
+            number=self._accepted,
+            frame=frame,
+            grid=grid,
+            border=border,
+            preferred=preferred_worker(affinity, self._supervisor.count),
+            accepted_s=loop.time(),
+            answer=loop.create_future(),
+        )
+        self._jobs.add(job)
+        self._queue.append(job)
+        self.dispatch()
+        try:
+            async with asyncio.timeout_at(job.accepted_s + limit_s):
+                return await job.answer
+        except TimeoutError:
+            raise DeadlineExceeded(
+                f"The frame was not rendered within {limit_s:g} s.", setting="render_deadline_s"
+            ) from None
+        finally:
+            if self._queue.remove(job):
+                self._finish(job)
+                self.dispatch()
+            elif job.answer.done() and not job.answer.cancelled():
+                job.answer.exception()  # seen, even where the caller went in the very moment of the answer
+
+    def _check_accepting(self, limit_s: float) -> None:
+        if self._closed:
+            raise Draining("The renderers are shutting down.")
+        if self._supervisor.count == 0 or self._supervisor.broken:
+            raise RendererUnavailable(self._supervisor.reason, retry_after_s=1.0)
+        if len(self._queue) >= self._settings.queue_frames:
+            expected_s = len(self._queue) * self._mean_render_s / max(1, self._supervisor.count)
+            raise QueueFull(
+                f"{len(self._queue)} frames wait for a renderer already.",
+                setting="queue_frames",
+                retry_after_s=round(max(0.1, expected_s), 1),
+            )
+        if limit_s <= 0:
+            raise DeadlineExceeded("The deadline had passed before the frame was accepted.")
+
+    def state(self) -> PoolState:
+        reason = "The renderers are shutting down." if self._closed else self._supervisor.reason
+        return PoolState(
+            ready=not reason,
+            reason=reason,
+            renderer=self._supervisor.info,
+            queued=len(self._queue),
+            workers=self._supervisor.states(),
+        )
+
+    async def close(self, grace_s: float) -> None:
+        """Finishes what was accepted, at most ``grace_s`` seconds, then ends the workers and frees shared memory."""
+        self._closed = True
+        try:
+            async with asyncio.timeout(grace_s):
+                while self._jobs and not self._supervisor.broken:
+                    self._done_all.clear()
+                    await self._done_all.wait()
+        except TimeoutError:
+            log.warning("frames given up at shutdown", frames=len(self._jobs))
+        finally:
+            await self._supervisor.close()
+            await asyncio.to_thread(self._copies.shutdown)
+            self._queue = JobQueue()
+            for job in self._jobs:
+                job.slot = None
+                _settle(job, Draining("The service shut down before the frame was rendered."))
+            self._jobs.clear()
+            self._slots.close()
+            if self._meter_timer is not None:
+                self._meter_timer.cancel()
+            self._meter.pool(self.state())
+
+    # What the supervisor tells.
+
+    def dispatch(self) -> None:
+        """Gives waiting frames to workers that can take them: first to idle ones, there to the preferred one."""
+        while self._queue:
+            able = [w for w in self._supervisor.ready() if len(w.held) < self._settings.slots_per_worker]
+            able = [w for w in able if not w.held] or able
+            if not able:
+                break
+            job, preferred = self._queue.pick({worker.index for worker in able}, self._supervisor.count)
+            if job.slot is None:
+                try:
+                    job.slot = self._slots.acquire(job.slot_bytes)
+                except RendererUnavailable as error:
+                    self._queue.remove(job)
+                    _settle(job, error)
+                    self._finish(job)
+                    continue
+                if job.slot is None:
+                    break
+                if dropped := self._slots.take_dropped():
+                    self._supervisor.unmap(dropped)
+            self._queue.remove(job)
+            chosen = next((w for w in able if w.index == preferred), None) or min(able, key=lambda w: len(w.held))
+            self._assign(job, chosen)
+        self.note_state()
+
+    def on_answer(self, worker: WorkerProcess, answer: Done | Failed) -> None:
+        """A worker answered the first of the jobs it knows of."""
+        job = worker.sent.popleft()
+        worker.held.discard(job)
+        worker.rendered += 1
+        if isinstance(answer, Done):
+            self._meter.stage("render", answer.render_s)
+            self._mean_render_s += 0.1 * (answer.render_s - self._mean_render_s)
+            self._copy_out(job)
+        else:
+            _settle(job, answer.error)
+            self._finish(job)
+
+    def on_death(self, worker: WorkerProcess) -> None:
+        """A worker is gone: the frame it rendered is blamed, and all it held wait again, first in the queue."""
+        culprit = worker.sent[0] if worker.sent else None
+        for job in sorted(worker.held, key=lambda job: job.number, reverse=True):
+            if job is culprit:
+                job.deaths += 1
+            if job.deaths > 1:
+                _settle(job, PoisonFrame("Two workers died while they rendered this frame."))
+            if not job.copied:
+                continue  # the copy is under way, and what follows it sees that the worker is gone
+            if job.answer.done():
+                self._finish(job)
+            else:
+                self._queue.put_first(job)
+        worker.held.clear()
+        worker.sent.clear()
+
+    def on_broken(self, reason: str) -> None:
+        """No worker can be had: nobody waits in vain."""
+        for job in list(self._queue):
+            self._queue.remove(job)
+            _settle(job, RendererUnavailable(reason, retry_after_s=1.0))
+            self._finish(job)
+        self._done_all.set()
+
+    def on_restart(self, reason: str) -> None:
+        self._meter.worker_restarted(reason)
+
+    def on_change(self) -> None:
+        self.dispatch()
+
+    def note_state(self) -> None:
+        """Tells the meter what the pool looks like, soon, and not for every frame."""
+        if self._meter_timer is None:
+            loop = asyncio.get_running_loop()
+            self._meter_timer = loop.call_later(_METER_INTERVAL_S, self._tell_state)
+
+    def _tell_state(self) -> None:
+        self._meter_timer = None
+        self._meter.pool(self.state())
+
+    # The way of one frame.
+
+    def _assign(self, job: Job, worker: WorkerProcess) -> None:
+        worker.held.add(job)
+        if job.copied:
+            self._supervisor.send(job, worker)
+            return
+        self._meter.stage("queue", asyncio.get_running_loop().time() - job.accepted_s)
+        if job.slot is None:
+            raise RuntimeError("a job without a slot was assigned")
+        source = job.slot.memory[: job.size_bytes]
+
+        def copied() -> None:
+            job.copied = True
+            if job in worker.held and not job.answer.done():
+                self._supervisor.send(job, worker)
+                return
+            worker.held.discard(job)
+            if job.answer.done():
+                self._finish(job)
+            else:
+                self._queue.put_first(job)
+            self.dispatch()
+
+        self._copy(source, job.frame.data, copied)
+
+    def _copy_out(self, job: Job) -> None:
+        if job.answer.done() or job.slot is None:
+            self._finish(job)
+            return
+        result = np.empty(job.size_bytes, np.uint8)
+
+        def copied() -> None:
+            if not job.answer.done():
+                job.answer.set_result(result)
+            self._finish(job)
+            self.dispatch()
+
+        self._copy(result, job.slot.memory[job.size_bytes : 2 * job.size_bytes], copied)
+
+    def _copy(self, target: Bytes, source: Bytes, then: Callable[[], None]) -> None:
+        if source.size <= _INLINE_COPY_BYTES:
+            np.copyto(target, source)
+            then()
+            return
+        loop = asyncio.get_running_loop()
+        copying = loop.run_in_executor(self._copies, np.copyto, target, source)
+        copying.add_done_callback(lambda _: then())
+
+    def _finish(self, job: Job) -> None:
+        """The pool is done with the job; its slot is free for the next."""
+        if job.slot is not None:
+            self._slots.release(job.slot)
+        job.slot = None
+        self._jobs.discard(job)
+        if not self._jobs:
+            self._done_all.set()
+
+
+def _settle(job: Job, error: UnbendError) -> None:
+    if not job.answer.done():
+        job.answer.set_exception(error)

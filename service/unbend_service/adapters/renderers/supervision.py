@@ -1,0 +1,272 @@
+"""Supervisor: keeps the worker processes alive, and tells the pool what they say."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Protocol
+
+import structlog
+
+from unbend_service.adapters.renderers.channel import Done, Failed, Ready
+from unbend_service.adapters.renderers.jobs import Job
+from unbend_service.adapters.renderers.selection import RendererOptions
+from unbend_service.adapters.renderers.worker_process import WorkerProcess
+from unbend_service.application.ports import RendererInfo, WorkerState
+from unbend_service.domain.errors import RendererUnavailable
+
+log = structlog.get_logger(__name__)
+
+_START_TIMEOUT_S = 60.0
+#: A worker that lived so long, or rendered anything, was in order: its successor starts at once.
+_SOUND_LIFE_S = 2.0
+_FAILURES_TO_GIVE_UP = 3
+_LONGEST_BACKOFF_S = 30.0
+_LAST_WORDS_S = 2.0
+
+
+class Listener(Protocol):
+    """Who is told what happens to the workers."""
+
+    def on_answer(self, worker: WorkerProcess, answer: Done | Failed) -> None: ...
+
+    def on_death(self, worker: WorkerProcess) -> None: ...
+
+    def on_restart(self, reason: str) -> None: ...
+
+    def on_broken(self, reason: str) -> None: ...
+
+    def on_change(self) -> None:
+        """Some worker can take a frame now, or no longer."""
+        ...
+
+
+@dataclass(slots=True, eq=False)
+class _Place:
+    """Where a worker stands, and its successors after it.
+
+    Attributes:
+        failures: workers in a row that died here before they were of use.
+        timer: the limit of what it does now (starting, rendering one frame), or the wait before the next start.
+        verdict: why it was killed, if it was.
+    """
+
+    index: int
+    worker: WorkerProcess | None = None
+    restarts: int = 0
+    failures: int = 0
+    timer: asyncio.TimerHandle | None = None
+    verdict: str = ""
+
+    def stop_timer(self) -> None:
+        if self.timer is not None:
+            self.timer.cancel()
+            self.timer = None
+
+    def state(self) -> WorkerState:
+        worker = self.worker
+        if worker is None:
+            state = "dead"
+        elif worker.info is None:
+            state = "starting"
+        else:
+            state = "busy" if worker.held else "ready"
+        return WorkerState(f"render{self.index}", state, None if worker is None else worker.pid, self.restarts)
+
+
+class Supervisor:
+    """Starts workers, watches them, and starts others in place of those that die or hang.
+
+    Args:
+        hang_s: a worker that renders one frame for longer is killed.
+    """
+
+    def __init__(self, factory: str, options: RendererOptions, hang_s: float, listener: Listener) -> None:
+        self._factory = factory
+        self._options = options
+        self._hang_s = hang_s
+        self._listener = listener
+        self._places: list[_Place] = []
+        self._first: asyncio.Future[RendererInfo] | None = None
+        self._reaping: set[asyncio.Task[int]] = set()
+        self._last_error = ""
+        self._closed = False
+        self.info: RendererInfo | None = None
+
+    @property
+    def count(self) -> int:
+        """Workers that there should be."""
+        return len(self._places)
+
+    @property
+    def broken(self) -> bool:
+        """Whether workers died at start so often that nobody should wait for one."""
+        return bool(self._places) and all(
+            place.failures >= _FAILURES_TO_GIVE_UP and (place.worker is None or place.worker.info is None)
+            for place in self._places
+        )
+
+    @property
+    def reason(self) -> str:
+        """Why no worker can take a frame, in one sentence; empty if one can."""
+        if self.ready():
+            return ""
+        if not self._places:
+            return "The renderers were not started."
+        if self.broken:
+            return f"Every render worker died at start: {self._last_error}"
+        return "The render workers are starting."
+
+    def ready(self) -> list[WorkerProcess]:
+        """Workers that have their renderer."""
+        workers = (place.worker for place in self._places)
+        return [worker for worker in workers if worker is not None and worker.info is not None]
+
+    def states(self) -> list[WorkerState]:
+        return [place.state() for place in self._places]
+
+    async def start_first(self) -> RendererInfo:
+        """Starts one worker and returns what its renderer is.
+
+        Raises:
+            RendererUnavailable: it said that it cannot have one, or died again and again.
+        """
+        self._first = asyncio.get_running_loop().create_future()
+        self._places.append(_Place(0))
+        self._launch(self._places[0])
+        return await self._first
+
+    def start_others(self, count: int) -> None:
+        """Starts as many as are missing to ``count``."""
+        for index in range(len(self._places), count):
+            self._places.append(_Place(index))
+            self._launch(self._places[index])
+
+    def send(self, job: Job, worker: WorkerProcess) -> None:
+        """Gives the worker a job that it holds; if the worker is gone, its death will be told."""
+        try:
+            worker.begin(job)
+        except OSError:
+            worker.kill()
+            return
+        if len(worker.sent) == 1:
+            self._watch(self._places[worker.index], self._hang_s, "hung")
+
+    def unmap(self, slots: Iterable[int]) -> None:
+        """Tells every worker that slots are gone."""
+        slots = tuple(slots)
+        for worker in self.ready():
+            try:
+                worker.unmap(slots)
+            except OSError:
+                worker.kill()
+
+    async def close(self) -> None:
+        """Ends every worker: an idle one by itself, one at work by force."""
+        self._closed = True
+        for place in self._places:
+            place.stop_timer()
+            if place.worker is not None:
+                self._release(place.worker)
+                if place.worker.sent or place.worker.info is None:
+                    place.worker.kill()
+                place.worker = None
+        if self._reaping:
+            await asyncio.wait(self._reaping)
+
+    def _launch(self, place: _Place) -> None:
+        place.timer = None
+        place.verdict = ""
+        loop = asyncio.get_running_loop()
+        try:
+            place.worker = WorkerProcess(place.index, self._factory, self._options, loop.time())
+        except OSError as error:
+            self._last_error = f"{type(error).__name__}: {error}"
+            self._retry(place, "start_failed")
+            return
+        loop.add_reader(place.worker.channel.fileno(), self._read, place, place.worker)
+        self._watch(place, _START_TIMEOUT_S, "start_timeout")
+        self._listener.on_change()
+
+    def _read(self, place: _Place, worker: WorkerProcess) -> None:
+        while place.worker is worker:
+            try:
+                message = worker.receive()
+            except BlockingIOError:
+                break
+            except EOFError:
+                self._bury(place, worker)
+                break
+            if isinstance(message, Ready):
+                self._on_ready(place, worker, message.info)
+            elif isinstance(message, Failed) and message.task is None:
+                self._on_refusal(message)
+            else:
+                self._listener.on_answer(worker, message)
+                place.stop_timer()
+                if worker.sent:
+                    self._watch(place, self._hang_s, "hung")
+        self._listener.on_change()
+
+    def _on_ready(self, place: _Place, worker: WorkerProcess, info: RendererInfo) -> None:
+        place.stop_timer()
+        worker.info = self.info = info
+        log.info("render worker ready", worker=place.index, pid=worker.pid, renderer=info.name, device=info.device)
+        if self._first is not None and not self._first.done():
+            self._first.set_result(info)
+
+    def _on_refusal(self, refusal: Failed) -> None:
+        """The worker said itself why it cannot start; trying again at once would not help the first."""
+        self._last_error = str(refusal.error)
+        if self._first is not None and not self._first.done():
+            self._first.set_exception(refusal.error)
+
+    def _watch(self, place: _Place, limit_s: float, verdict: str) -> None:
+        def condemn() -> None:
+            if place.worker is not None:
+                place.verdict = verdict
+                place.worker.kill()
+
+        place.stop_timer()
+        place.timer = asyncio.get_running_loop().call_later(limit_s, condemn)
+
+    def _bury(self, place: _Place, worker: WorkerProcess) -> None:
+        place.worker = None
+        place.stop_timer()
+        worker.kill()
+        self._release(worker)
+        ready = worker.info is not None
+        reason = place.verdict or ("died" if ready else "start_failed")
+        lived_s = asyncio.get_running_loop().time() - worker.started_s
+        if ready and (worker.rendered or lived_s > _SOUND_LIFE_S):
+            place.failures = -1
+        log.warning("render worker gone", worker=place.index, pid=worker.pid, reason=reason, frames=len(worker.held))
+        self._listener.on_death(worker)
+        self._retry(place, reason)
+
+    def _retry(self, place: _Place, reason: str) -> None:
+        place.failures += 1
+        if self._first is not None and not self._first.done() and place.failures >= _FAILURES_TO_GIVE_UP:
+            self._first.set_exception(
+                RendererUnavailable(f"Render workers die at start: {self._last_error or reason}.")
+            )
+        if self._closed or (self._first is not None and self._first.done() and self._first.exception() is not None):
+            return
+        if self.broken:
+            self._listener.on_broken(self.reason)
+        place.restarts += 1
+        self._listener.on_restart(reason)
+        if place.failures <= 0:
+            self._launch(place)
+            return
+        backoff_s = min(_LONGEST_BACKOFF_S, 0.1 * 2**place.failures)
+        place.timer = asyncio.get_running_loop().call_later(backoff_s, self._launch, place)
+
+    def _release(self, worker: WorkerProcess) -> None:
+        """Closes the channel, at which an idle worker ends, and waits for the end of the process off the loop."""
+        asyncio.get_running_loop().remove_reader(worker.channel.fileno())
+        worker.channel.close()
+        reaping = asyncio.create_task(asyncio.to_thread(worker.reap, _LAST_WORDS_S))
+        self._reaping.add(reaping)
+        reaping.add_done_callback(self._reaping.discard)

@@ -1,0 +1,119 @@
+"""The parent's side of one worker: its process, its channel, and what it holds."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections import OrderedDict, deque
+from collections.abc import Iterable
+
+import numpy as np
+
+from unbend_service.adapters.renderers.channel import Begin, Channel, FromWorker, MapSlot, Task, UnmapSlots
+from unbend_service.adapters.renderers.jobs import Job
+from unbend_service.adapters.renderers.selection import RendererOptions
+from unbend_service.application.ports import RendererInfo
+
+_GRIDS_KEPT_BYTES = 32 << 20
+
+
+class WorkerProcess:
+    """A started worker process. A new process is executed, never forked, so it inherits neither threads nor contexts.
+
+    Attributes:
+        index: place in the pool; the process that replaces a dead one has the same.
+        info: its renderer, None until it is ready.
+        held: jobs that were assigned to it.
+        sent: jobs that it knows of, in its order of work; the first is the one it renders.
+        rendered: frames it has answered.
+        started_s: loop time of its start.
+    """
+
+    def __init__(self, index: int, factory: str, options: RendererOptions, started_s: float) -> None:
+        self.index = index
+        self.info: RendererInfo | None = None
+        self.held: set[Job] = set()
+        self.sent: deque[Job] = deque()
+        self.rendered = 0
+        self.started_s = started_s
+        self._mapped: set[int] = set()
+        self._grids: OrderedDict[str, int] = OrderedDict()
+        self.channel, theirs = Channel.pair()
+        try:
+            self._process = subprocess.Popen(
+                # -P: a file of the working directory must not stand in for a module of the service
+                [sys.executable, "-P", "-m", "unbend_service.adapters.renderers.worker", str(theirs.fileno())],
+                stdin=subprocess.DEVNULL,
+                pass_fds=(theirs.fileno(),),
+                env={"LP_NUM_THREADS": str(options.threads), **os.environ},
+            )
+        except OSError:
+            self.channel.close()
+            raise
+        finally:
+            theirs.close()
+        self.channel.send(Begin(f"unbend-render{index}", factory, options))
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def begin(self, job: Job) -> None:
+        """Tells the worker of a job whose source is in its slot; raises OSError when the worker is gone."""
+        slot = job.slot
+        if slot is None:
+            raise RuntimeError("a job without a slot was sent")
+        if slot.number not in self._mapped:
+            self.channel.send(MapSlot(slot.number, slot.size_bytes), slot.fd)
+            self._mapped.add(slot.number)
+        known = job.grid.id in self._grids
+        self._grids[job.grid.id] = job.grid.source.nbytes
+        self._grids.move_to_end(job.grid.id)
+        forget = []
+        while len(self._grids) > 1 and sum(self._grids.values()) > _GRIDS_KEPT_BYTES:
+            forget.append(self._grids.popitem(last=False)[0])
+        if not known:
+            lattice = job.grid.source.reshape(-1).view(np.uint8)
+            slot.memory[job.lattice_offset : job.lattice_offset + lattice.size] = lattice
+        frame = job.frame
+        self.channel.send(
+            Task(
+                number=job.number,
+                slot=slot.number,
+                pixel_format=frame.pixel_format,
+                width=frame.width,
+                height=frame.height,
+                border=job.border,
+                grid_id=job.grid.id,
+                lattice=None if known else (job.grid.rows, job.grid.columns),
+                lattice_offset=job.lattice_offset,
+                forget=tuple(forget),
+            )
+        )
+        self.sent.append(job)
+
+    def unmap(self, slots: Iterable[int]) -> None:
+        """Tells the worker that slots are gone; raises OSError when the worker is gone."""
+        if numbers := self._mapped.intersection(slots):
+            self._mapped -= numbers
+            self.channel.send(UnmapSlots(tuple(numbers)))
+
+    def receive(self) -> FromWorker:
+        """The next message; raises as :meth:`Channel.receive`."""
+        message, _ = self.channel.receive()
+        if isinstance(message, Begin | MapSlot | UnmapSlots | Task):
+            raise EOFError
+        return message
+
+    def kill(self) -> None:
+        """Ends the process at once, whatever it does."""
+        self._process.kill()
+
+    def reap(self, patience_s: float) -> int:
+        """Waits for the process to end, kills it after ``patience_s``; blocking. Returns its exit status."""
+        try:
+            return self._process.wait(patience_s)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            return self._process.wait()
