@@ -4,6 +4,10 @@ A set network in the manner of Set Transformer's pooling by attention (Lee et al
 the same small perceptron; rounds of softmax pooling with a few learned queries build up one global state, which is
 fed back to the chains between rounds. Order and number of the chains do not matter.
 
+After the founding rounds there is a first estimate. Each refinement round straightens the chains with the estimate so
+far (see `straightening`), tells every chain what became of it, pools again, and adds a correction: a learned
+Gauss-Newton step.
+
 Output: 48 node values (see `labels`), isotropic frame, as coefficients of a fixed, scaled principal basis around the
 straight guides; and, from a head whose gradient stops at its input, log scales of their errors.
 """
@@ -17,6 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from training.labels import STRAIGHT, VALUES
+from training.straightening import FEEDBACK, Straightening
 
 SPREADS = VALUES + 2
 """Log Laplace scale of each coefficient, log mean error of all, log mean error of the nonlinear part (px of 256)."""
@@ -24,49 +29,81 @@ SPREADS = VALUES + 2
 
 @dataclass(frozen=True)
 class NetworkShape:
-    """Sizes; `founding_rounds` contribute from the start, later rounds grow from nothing (gates start at zero)."""
+    """Sizes."""
 
     features: int
     chain_width: int = 128
     queries: int = 16
     global_width: int = 256
-    rounds: int = 5
-    founding_rounds: int = 3
+    rounds: int = 3
+    refinements: int = 2
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
 
 
-class PoolingRound(nn.Module):
-    """Chains -> global state, and (unless it is the last round) global state -> chains."""
+class Layout:
+    """Where the chains of a batch lie: padded to (B, N), or packed without padding, which is twice as fast.
 
-    def __init__(self, shape: NetworkShape, index: int) -> None:
+    mask: (B, N) float, 1 where a chain is. place: (m,) index of each packed chain in the flattened mask, and picture:
+    (m,) its index in the batch; None when padded.
+    """
+
+    def __init__(self, mask: Tensor, place: Tensor | None = None, picture: Tensor | None = None) -> None:
+        self.mask, self.place, self.picture = mask, place, picture
+
+    def padded(self, chains: Tensor) -> Tensor:
+        """Per-chain rows as (B, N, width)."""
+        if self.place is None:
+            return chains
+        size, slots = self.mask.shape
+        full = chains.new_zeros(size * slots, chains.shape[1]).index_copy(0, self.place, chains)
+        return full.view(size, slots, -1)
+
+    def spread(self, pictures: Tensor) -> Tensor:
+        """Per-picture rows (B, width), repeated for (or ready to broadcast over) their chains."""
+        return pictures[:, None] if self.picture is None else pictures.index_select(0, self.picture)
+
+
+class Pooling(nn.Module):
+    """Chains -> global state."""
+
+    def __init__(self, shape: NetworkShape, *, first: bool) -> None:
         super().__init__()
         width, state = shape.chain_width, shape.global_width
-        first, grown = index == 0, index >= shape.founding_rounds
         self.norm = nn.LayerNorm(width)
         self.score = nn.Linear(width, shape.queries)
         self.merge = nn.Linear(shape.queries * width + (0 if first else state), state)
         self.merge_norm = nn.LayerNorm(state)
-        self.gate = nn.Parameter(torch.full((state,), 0.0 if grown else 1.0))
-        self.is_last = index == shape.rounds - 1
-        if not self.is_last:
-            self.feedback = nn.Linear(state, width)
-            self.inner = nn.Linear(width, width)
-            self.outer = nn.Linear(width, width)
-            if index >= shape.founding_rounds - 1:
-                nn.init.zeros_(self.outer.weight)
-                nn.init.zeros_(self.outer.bias)
 
-    def pooled(self, chains: Tensor, scores: Tensor, mask: Tensor, state: Tensor | None) -> Tensor:
-        """Next global state (B, state) from normed chains (B, N, width), scores (B, N, queries), mask (B, N)."""
-        present = mask[..., None].to(scores.dtype)
+    def forward(self, chains: Tensor, state: Tensor | None, layout: Layout) -> tuple[Tensor, Tensor]:
+        """The next state (B, state), and the normed chains."""
+        normed = self.norm(chains).to(chains.dtype)
+        scores = layout.padded(self.score(normed)).float()
+        present = layout.mask[..., None]
         attention = torch.softmax(scores + (present - 1) * 30, 1) * present
-        summary = torch.bmm(attention.to(chains.dtype).transpose(1, 2), chains).flatten(1)
+        summary = torch.bmm(attention.to(normed.dtype).transpose(1, 2), layout.padded(normed)).flatten(1)
         if state is not None:
             summary = torch.cat([summary, state.to(summary.dtype)], 1)
-        gain = self.gate * torch.relu(self.merge_norm(self.merge(summary)))
-        return gain if state is None else state + gain
+        gain = torch.relu(self.merge_norm(self.merge(summary)))
+        return (gain if state is None else state + gain), normed
+
+
+class Feedback(nn.Module):
+    """Global state (and, in refinements, what became of each chain) -> chains."""
+
+    def __init__(self, shape: NetworkShape, *, refines: bool) -> None:
+        super().__init__()
+        self.state = nn.Linear(shape.global_width, shape.chain_width)
+        self.inner = nn.Linear(shape.chain_width, shape.chain_width)
+        self.outer = nn.Linear(shape.chain_width, shape.chain_width)
+        self.straightened = nn.Linear(FEEDBACK, shape.chain_width) if refines else None
+
+    def forward(self, chains: Tensor, normed: Tensor, state: Tensor, told: Tensor | None, layout: Layout) -> Tensor:
+        hidden = self.inner(normed) + layout.spread(self.state(state))
+        if self.straightened is not None and told is not None:
+            hidden = hidden + self.straightened(told)
+        return chains + self.outer(torch.relu(hidden))
 
 
 class LinesetNetwork(nn.Module):
@@ -87,55 +124,64 @@ class LinesetNetwork(nn.Module):
         self.register_buffer("straight", torch.tensor(STRAIGHT, dtype=torch.float32))
         self.embed_first = nn.Linear(shape.features, width)
         self.embed_second = nn.Linear(width, width)
-        self.rounds = nn.ModuleList([PoolingRound(shape, i) for i in range(shape.rounds)])
-        self.head = nn.Sequential(nn.Linear(state, state), nn.ReLU(), nn.Linear(state, VALUES))
-        self.spread_head = nn.Sequential(nn.Linear(state + VALUES + 1, 128), nn.ReLU(), nn.Linear(128, SPREADS))
-        for last in (self.head[2], self.spread_head[2]):
-            assert isinstance(last, nn.Linear)
-            nn.init.normal_(last.weight, std=0.01)
-            nn.init.zeros_(last.bias)
+        total = shape.rounds + shape.refinements
+        self.poolings = nn.ModuleList([Pooling(shape, first=i == 0) for i in range(total)])
+        self.feedbacks = nn.ModuleList([Feedback(shape, refines=i >= shape.rounds) for i in range(1, total)])
+        self.straightening = Straightening()
+        self.heads = nn.ModuleList([_perceptron(state, state, VALUES) for _ in range(1 + shape.refinements)])
+        self.spread_head = _perceptron(state + VALUES + 1, 128, SPREADS)
+        for correction in self.heads[1:]:
+            nn.init.zeros_(correction[2].weight)
 
     def forward(self, features: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
         """features (B, N, F), mask (B, N) float, 1 where a chain is -> node values (B, 48), spreads (B, 50)."""
+        estimates, spreads = self.estimates(features, Layout(mask))
+        return estimates[-1], spreads
+
+    def estimates(self, features: Tensor, layout: Layout) -> tuple[list[Tensor], Tensor]:
+        """Node values (B, 48) after the founding rounds and after each refinement, and the spreads of the last.
+
+        features: (B, N, F), or packed (m, F), as the layout says.
+        """
         chains = self._embedded(features)
         state: Tensor | None = None
-        for index, stage in enumerate(self._stages()):
-            normed = stage.norm(chains)
-            state = stage.pooled(normed, stage.score(normed), mask, state)
-            if index < len(self.rounds) - 1:
-                chains = chains + stage.outer(torch.relu(stage.inner(normed) + stage.feedback(state)[:, None]))
+        estimates: list[Tensor] = []
+        normed = chains
+        for index, pooling in enumerate(self.poolings):
+            if state is not None:
+                told = self._told(estimates[-1], features, layout) if estimates else None
+                chains = self.feedbacks[index - 1](chains, normed, state, told, layout)
+            state, normed = pooling(chains, state, layout)
+            if index >= self.shape.rounds - 1:
+                estimates.append(self._estimate(state, estimates))
         assert state is not None
-        return self._heads(state, mask)
-
-    def packed(self, features: Tensor, place: Tensor, picture: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """The same for chains without padding, which is twice as fast: features (m, F), place (m,) their index in
-        the flattened (B, N) mask, picture (m,) their index in the batch."""
-        size, slots = mask.shape
-        chains = self._embedded(features)
-        state: Tensor | None = None
-        for index, stage in enumerate(self._stages()):
-            normed = stage.norm(chains).to(chains.dtype)
-            scores = stage.score(normed)
-            full = normed.new_zeros(size * slots, normed.shape[1]).index_copy(0, place, normed)
-            full_scores = scores.new_zeros(size * slots, scores.shape[1]).index_copy(0, place, scores)
-            state = stage.pooled(full.view(size, slots, -1), full_scores.view(size, slots, -1).float(), mask, state)
-            if index < len(self.rounds) - 1:
-                told = stage.feedback(state).index_select(0, picture)
-                chains = chains + stage.outer(torch.relu(stage.inner(normed) + told))
-        assert state is not None
-        return self._heads(state, mask)
-
-    def _stages(self) -> list[PoolingRound]:
-        return [stage for stage in self.rounds if isinstance(stage, PoolingRound)]
+        return estimates, self._spreads(state, estimates[-1], layout)
 
     def _embedded(self, features: Tensor) -> Tensor:
         normed = ((features - self.feature_mean) / self.feature_scale).clamp(-8, 8)
         return torch.relu(self.embed_second(torch.relu(self.embed_first(normed))))
 
-    def _heads(self, state: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+    def _told(self, values: Tensor, features: Tensor, layout: Layout) -> Tensor:
+        with torch.no_grad(), torch.autocast("cpu", enabled=False):
+            told: Tensor = self.straightening(layout.spread(values), features)
+            return told
+
+    def _estimate(self, state: Tensor, before: list[Tensor]) -> Tensor:
         with torch.autocast("cpu", enabled=False):
-            state = state.float()
-            coefficients = self.head(state)
-            chains = torch.log1p(mask.sum(1, keepdim=True)) * 0.25
-            spreads = self.spread_head(torch.cat([state.detach(), coefficients.detach(), chains], 1))
-            return self.straight + coefficients @ self.basis.t(), spreads
+            change: Tensor = self.heads[len(before)](state.float()) @ self.basis.t()
+            # Each refinement answers for its own correction; the estimate it started from has a loss of its own.
+            return (before[-1].detach() if before else self.straight) + change
+
+    def _spreads(self, state: Tensor, values: Tensor, layout: Layout) -> Tensor:
+        with torch.autocast("cpu", enabled=False):
+            chains = torch.log1p(layout.mask.sum(1, keepdim=True)) * 0.25
+            known = [state.float().detach(), (values - self.straight).detach() * 4, chains]
+            spreads: Tensor = self.spread_head(torch.cat(known, 1))
+            return spreads
+
+
+def _perceptron(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
+    last = nn.Linear(hidden, outputs)
+    nn.init.normal_(last.weight, std=0.01)
+    nn.init.zeros_(last.bias)
+    return nn.Sequential(nn.Linear(inputs, hidden), nn.ReLU(), last)

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from training.checkpoints import Checkpoint
 from training.labels import STRAIGHT, VALUES
-from training.lineset_network import LinesetNetwork, NetworkShape
+from training.lineset_network import Layout, LinesetNetwork, NetworkShape
 from training.losses import errors, spread_loss, tempered
 from training.random_distortions import KINDS
 from training.sampler import Sampler, TrainingBatch
@@ -125,9 +125,11 @@ class Run:
             torch.from_numpy(a) for a in (batch.source, batch.target, batch.weight, batch.slopes, batch.labels)
         )
         with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.recipe.bfloat16):
-            values, spreads = self.network.packed(*packed_input(batch))
-        overall, nonlinear = errors(values, source, target, weight, slopes)
-        guide_loss = (tempered(overall) + self.recipe.nonlinear_weight * tempered(nonlinear)).mean()
+            estimates, spreads = self.network.estimates(*packed_input(batch))
+        guide_loss = torch.zeros(())
+        for values in estimates:
+            overall, nonlinear = errors(values, source, target, weight, slopes)
+            guide_loss = guide_loss + (tempered(overall) + self.recipe.nonlinear_weight * tempered(nonlinear)).mean()
         spread = spread_loss(spreads, values, labels, self.inverse_basis, overall, nonlinear)
         self.optimiser.zero_grad(set_to_none=True)
         torch.autograd.backward(guide_loss + spread)
@@ -141,19 +143,14 @@ class Run:
         return overall.detach(), nonlinear.detach(), float(spread.detach())
 
 
-def packed_input(batch: TrainingBatch) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Arguments of `LinesetNetwork.packed`."""
+def packed_input(batch: TrainingBatch) -> tuple[Tensor, Layout]:
+    """Arguments of `LinesetNetwork.estimates`."""
     chains = batch.chains
     slots = int(chains.slot.max(initial=0)) + 1
-    place = chains.picture * slots + chains.slot
     mask = np.zeros((chains.batch_size, slots), np.float32)
     mask[chains.picture, chains.slot] = 1
-    return (
-        torch.from_numpy(chains.features),
-        torch.from_numpy(place),
-        torch.from_numpy(chains.picture),
-        torch.from_numpy(mask),
-    )
+    place = torch.from_numpy(chains.picture * slots + chains.slot)
+    return torch.from_numpy(chains.features), Layout(torch.from_numpy(mask), place, torch.from_numpy(chains.picture))
 
 
 class Progress:

@@ -29,7 +29,7 @@ KINDS = (
     "homography",
     "mixture",
 )
-SHARES = (0.08, 0.085, 0.085, 0.045, 0.045, 0.055, 0.10, 0.105, 0.065, 0.095, 0.085, 0.035, 0.12)
+SHARES = (0.07, 0.085, 0.09, 0.06, 0.06, 0.09, 0.10, 0.09, 0.05, 0.08, 0.075, 0.03, 0.12)
 
 LENS_COVERS = 1.5
 """Distorted radius that a lens must reach without a fold; a square picture's corner is at 1.41. (An equidistant

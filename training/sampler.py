@@ -56,7 +56,7 @@ class Sampler:
     """Draws batches from a store; all randomness comes from the generator passed in."""
 
     def __init__(
-        self, store: ChainStore, drawn_share: float = 0.22, tilt_share: float = 0.2, square_share: float = 0.5
+        self, store: ChainStore, drawn_share: float = 0.22, tilt_share: float = 0.1, square_share: float = 0.5
     ) -> None:
         self._store = store
         self._x = store.x.astype(np.float32) / np.float32(QUANTUM)

@@ -29,27 +29,27 @@ def inherit(network: LinesetNetwork, weights: Path) -> None:
     new["feature_scale"][:known] = old["fs"]
     new["embed_first.weight"].zero_()
     new["embed_first.weight"][:, :known] = old["e.0.weight"]
-    names = {"embed_first.bias": "e.0.bias", "embed_second": "e.2", "head.0": "h.0"}
+    names = {"embed_first.bias": "e.0.bias", "embed_second": "e.2", "heads.0.0": "h.0"}
     for index in range(_OLD_ROUNDS):
         names |= {
-            f"rounds.{index}.norm": f"hn.{index}",
-            f"rounds.{index}.score": f"sc.{index}",
-            f"rounds.{index}.merge": f"g.{index}",
-            f"rounds.{index}.merge_norm": f"gn.{index}",
+            f"poolings.{index}.norm": f"hn.{index}",
+            f"poolings.{index}.score": f"sc.{index}",
+            f"poolings.{index}.merge": f"g.{index}",
+            f"poolings.{index}.merge_norm": f"gn.{index}",
         }
         if index < _OLD_ROUNDS - 1:
             names |= {
-                f"rounds.{index}.feedback": f"fb.{index}",
-                f"rounds.{index}.inner": f"up.{index}",
-                f"rounds.{index}.outer": f"up2.{index}",
+                f"feedbacks.{index}.state": f"fb.{index}",
+                f"feedbacks.{index}.inner": f"up.{index}",
+                f"feedbacks.{index}.outer": f"up2.{index}",
             }
     for new_name, old_name in names.items():
         for suffix in ("", ".weight", ".bias"):
             if new_name + suffix in new and old_name + suffix in old:
                 new[new_name + suffix].copy_(old[old_name + suffix])
     translate = _translation(network.basis, old["basis"])
-    new["head.2.weight"].copy_(translate @ old["h.2.weight"])
-    new["head.2.bias"].copy_(translate @ old["h.2.bias"])
+    new["heads.0.2.weight"].copy_(translate @ old["h.2.weight"])
+    new["heads.0.2.bias"].copy_(translate @ old["h.2.bias"])
     network.load_state_dict(new)
 
 

@@ -1,0 +1,111 @@
+"""What guides make of a chain: its points moved to the target, and how straight they lie there.
+
+The network's refinement rounds are told this of their own estimate, so that they can correct it the way a plumb-line
+method would. Isotropic frame; no gradient flows through it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from training.labels import ANCHORS, NODES
+from unbend_service.adapters.estimators.chain_features import LEGENDRE_DEGREE, REFERENCE, SAMPLES
+
+FEEDBACK = SAMPLES + 8
+
+_NEWTON_STEPS = 3
+_FURTHEST = 2.5
+_SHALLOWEST_SLOPE = 0.2
+
+
+def _monomials(nodes: np.ndarray[tuple[int], np.dtype[np.float64]]) -> Tensor:
+    """(n, n): row i holds the monomial coefficients of the i-th Lagrange polynomial over the nodes."""
+    return torch.tensor(np.linalg.inv(np.vander(nodes, increasing=True)).T, dtype=torch.float32)
+
+
+def _legendre_projection() -> Tensor:
+    """(SAMPLES, degree + 1): offsets at evenly spaced parameters -> Legendre coefficients, least squares."""
+    basis = np.polynomial.legendre.legvander(np.linspace(-1, 1, SAMPLES), LEGENDRE_DEGREE)
+    return torch.tensor(np.linalg.pinv(basis).T, dtype=torch.float32)
+
+
+class Straightening(nn.Module):
+    """Feedback features of chains under guides."""
+
+    by_node: Tensor
+    by_anchor: Tensor
+    legendre: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("by_node", _monomials(NODES), persistent=False)
+        self.register_buffer("by_anchor", _monomials(ANCHORS), persistent=False)
+        self.register_buffer("legendre", _legendre_projection(), persistent=False)
+
+    def forward(self, values: Tensor, features: Tensor) -> Tensor:
+        """values: (..., 48) node values; features: (..., FEATURES) of chains, whose first 2 SAMPLES are the chain's
+        points; leading shapes broadcast. Returns (..., FEEDBACK).
+
+        Per chain, in reference pixels: the offsets of its straightened points across it; the second and third Legendre
+        coefficients of these, corrected by what all points of the chain say beyond the samples; its direction.
+        """
+        x, y = features[..., :SAMPLES], features[..., SAMPLES : 2 * SAMPLES]
+        half = values.shape[-1] // 2
+        t = self._target(values[..., :half], x, y)
+        s = self._target(values[..., half:], y, x)
+        offset, cos, sin = _across(s, t)
+        before, _, _ = _across(x, y)
+        fitted = offset @ self.legendre
+        missing = self._from_all_points(features) - (before @ self.legendre)[..., 2:4]
+        bend = fitted[..., 2:4] + missing
+        horizontal = (cos.abs() >= sin.abs()).float()
+        deviation = torch.where(cos.abs() >= sin.abs(), sin / cos.clamp(min=0.5), -cos / sin.abs().clamp(min=0.5))
+        direction = torch.cat(
+            [2 * cos * cos - 1, 2 * sin * cos, horizontal, torch.asinh(deviation * (90 / math.pi))], -1
+        )
+        return torch.cat(
+            [torch.asinh(offset / 0.5), torch.asinh(bend / 0.3), torch.asinh(bend / 0.05) / 3, direction], -1
+        )
+
+    def _target(self, guides: Tensor, along: Tensor, across: Tensor) -> Tensor:
+        """Target coordinate of points: solves sum_k L_k(t) P_k(along) = across for t by Newton's method.
+
+        guides: (..., 24) node values of one direction's guides. along, across: (..., SAMPLES).
+        """
+        shape = guides.shape[:-1]
+        coefficients = guides.reshape(*shape, len(ANCHORS), len(NODES)) @ self.by_node
+        in_target = self.by_anchor.t() @ coefficients
+        power = torch.ones_like(along)
+        curves = [torch.zeros_like(along) for _ in range(len(ANCHORS))]
+        for degree in range(len(NODES)):
+            curves = [c + in_target[..., k, degree, None] * power for k, c in enumerate(curves)]
+            power = power * along
+        a, b, c, d = curves
+        target = across
+        for _ in range(_NEWTON_STEPS):
+            slope = (b + target * (2 * c + 3 * d * target)).clamp(min=_SHALLOWEST_SLOPE)
+            miss = a + target * (b + target * (c + d * target)) - across
+            target = (target - (miss / slope).clamp(-0.6, 0.6)).clamp(-_FURTHEST, _FURTHEST)
+        return target
+
+    def _from_all_points(self, features: Tensor) -> Tensor:
+        """Second and third Legendre coefficients that `chain_features` fitted to all points, undone from arcsinh."""
+        first = 3 * SAMPLES
+        return torch.sinh(features[..., first : first + 2].clamp(-5, 5)) * 0.3
+
+
+def _across(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Offsets (..., SAMPLES) of points across the line through them, reference pixels; cos and sin (..., 1) of its
+    direction, read as `chain_features` reads it."""
+    steps = torch.linspace(-1, 1, SAMPLES)
+    from_x, from_y = x - x.mean(-1, keepdim=True), y - y.mean(-1, keepdim=True)
+    run, rise = (from_x * steps).sum(-1, keepdim=True), (from_y * steps).sum(-1, keepdim=True)
+    length = torch.sqrt(run * run + rise * rise + 1e-12)
+    cos, sin = run / length, rise / length
+    flip = torch.where(torch.where(cos.abs() >= sin.abs(), cos, sin) < 0, -1.0, 1.0)
+    cos, sin = cos * flip, sin * flip
+    return (cos * from_y - sin * from_x) * REFERENCE, cos, sin
