@@ -18,6 +18,8 @@ Float64 = npt.NDArray[np.float64]
 _FARTHEST = 3.0
 #: Bound of the relative change of pace per step (an eighth of the frame).
 _LARGEST_BEND = 1.0
+#: An edge so far outside the picture begins to be led straight away from it, at twice that it is; half picture widths.
+_BLENDED = 0.125
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +73,12 @@ def _beyond(lattice: Float64, margin: int) -> Float64:
 
     Let e, i, j be the edge and the points one and two steps (an eighth of the frame each) inside it, d1 and d2 the
     first and second difference of the parabola through them, outwards. d2 = a d1 + b n with n normal to d1. Along d1
-    the parabola k + a k^2 / 2 is kept if it hastens (a >= 0); one that slackens would come back, so k / (1 - a k / 2)
-    takes its place, which has the same curvature at the edge and never turns. Across, the parabola is left for its
-    tangent after two steps.
+    the parabola k + a k^2 / 2 is kept if it hastens (a >= 0); one that slackens would come back, so log(1 - a k) / -a
+    takes its place, which has the same curvature at the edge, never turns and has no limit. Across, the parabola is
+    left for its tangent after two steps.
+
+    An edge that lies outside the picture may be an extrapolation already. It is led straight away from the picture,
+    so that nothing comes into sight again out there; in between the two are blended.
     """
     distance = np.arange(1, margin + 1)[:, None, None]
     count = len(lattice)
@@ -87,6 +92,10 @@ def _beyond(lattice: Float64, margin: int) -> Float64:
     bend = np.clip((change * pace).sum(axis=-1, keepdims=True) / squared, -_LARGEST_BEND, _LARGEST_BEND)
     sideways = change - (change * pace).sum(axis=-1, keepdims=True) / squared * pace
     k = distance / step
-    along = np.where(bend >= 0, k + bend * k**2 / 2, k / (1 - np.minimum(bend, 0) * k / 2))
+    slackening = np.minimum(bend, -1e-6)
+    along = np.where(bend >= 0, k + bend * k**2 / 2, np.log1p(-slackening * k) / -slackening)
     across = np.where(k <= 2, k**2 / 2, 2 * k - 2)
-    return np.asarray(edge + along * pace + across * sideways)
+    curved = edge + along * pace + across * sideways
+    outside = np.clip((np.abs(edge).max(axis=-1, keepdims=True) - 1) / _BLENDED - 1, 0, 1)
+    away = edge * (1 + k / 4)
+    return np.asarray(curved + outside * (away - curved))

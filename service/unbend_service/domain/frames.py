@@ -5,13 +5,14 @@ Frames are pixels and nothing else: rows from top to bottom, no padding between 
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
 import numpy.typing as npt
 
-from unbend_service.domain.errors import InvalidFrame, UnsupportedPixelFormat
+from unbend_service.domain.errors import InvalidFrame, InvalidOption, UnsupportedPixelFormat
 
 Bytes = npt.NDArray[np.uint8]
 
@@ -135,12 +136,34 @@ class Border:
     Attributes:
         red, green, blue: 0..255, full range; converted to the frame's own colours by :meth:`samples`.
         alpha: 0..255, used where the format has alpha.
+
+    Raises:
+        InvalidOption: a number outside 0..255.
     """
 
     red: int = 0
     green: int = 0
     blue: int = 0
     alpha: int = 255
+
+    def __post_init__(self) -> None:
+        if not all(0 <= value <= 255 for value in (self.red, self.green, self.blue, self.alpha)):
+            raise InvalidOption("A border colour is out of range.", allowed="0..255 each")
+
+    @classmethod
+    def parse(cls, text: str) -> Border:
+        """``black``, ``white``, ``grey``, ``transparent``, or a colour as rrggbb or rrggbbaa in hex, ``#`` optional.
+
+        Raises:
+            InvalidOption: anything else.
+        """
+        named = _NAMED_BORDERS.get(text.lower())
+        if named is not None:
+            return named
+        digits = text.removeprefix("#")
+        if not re.fullmatch(r"[0-9a-fA-F]{6}(?:[0-9a-fA-F]{2})?", digits):
+            raise InvalidOption(f"border={text!r} is not known.", allowed=BORDERS_ALLOWED)
+        return cls(*bytes.fromhex(digits))
 
     def samples(self, pixel_format: PixelFormat) -> tuple[tuple[int, ...], ...]:
         """Sample values, one tuple per plane, one number per channel.
@@ -166,3 +189,10 @@ class Border:
 
 BLACK = Border()
 TRANSPARENT = Border(alpha=0)
+BORDERS_ALLOWED = "black, white, grey, transparent, rrggbb or rrggbbaa in hex"
+_NAMED_BORDERS = {
+    "black": BLACK,
+    "white": Border(255, 255, 255),
+    "grey": Border(128, 128, 128),
+    "transparent": TRANSPARENT,
+}

@@ -131,10 +131,10 @@ class Grid:
                 allowed=f"rows x columns points, 2 to {MAX_POINTS} of each",
             )
         try:
-            array = np.array(points, dtype=np.float64)
+            array = np.array(points)
         except (TypeError, ValueError, OverflowError) as error:
             raise InvalidGrid("source must be a list of [x, y] numbers.") from error
-        if array.shape != (rows * columns, 2):
+        if array.shape != (rows * columns, 2) or array.dtype.kind not in "fiu":
             raise InvalidGrid("source must be a list of [x, y] numbers.")
         with np.errstate(over="ignore"):  # an overflow becomes infinite and is refused as such
             return cls(array.reshape(rows, columns, 2).astype(np.float32))

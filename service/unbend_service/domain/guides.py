@@ -172,6 +172,7 @@ class Guides:
             raise InvalidGuides("Row and column guides do not intersect everywhere in the picture.")
         before, _ = self._intersect(points * (0.9 * low)[:, None])
         pace = (last - before) / np.maximum(0.1 * low, 1e-9)[:, None]
+        pace *= np.minimum(1, 2 / np.maximum(np.hypot(*pace.T), 1e-9))[:, None]  # near a fold it has no bound
         return np.asarray(last + pace * (1 - low)[:, None])
 
     def to_dict(self) -> dict[str, Any]:

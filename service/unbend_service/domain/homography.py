@@ -11,11 +11,14 @@ _LATTICE_POINTS = 33
 
 
 def apply_homography(matrix: Float64, points: Float64) -> Float64:
-    """(3, 3) matrix on (..., 2) points of the plane it was fitted in; denominators are kept away from zero."""
+    """(3, 3) matrix on (..., 2) points of the plane it was fitted in.
+
+    Points on the horizon of the middle or behind it have no image; they are put far out instead of coming back from
+    the other side.
+    """
     projected = points @ matrix[:, :2].T + matrix[:, 2]
-    denominator = projected[..., 2:]
-    safe = np.where(np.abs(denominator) < 1e-3, 1e-3, denominator)
-    return np.asarray(projected[..., :2] / safe)
+    side = -1.0 if matrix[2, 2] < 0 else 1.0
+    return np.asarray(projected[..., :2] / (np.maximum(projected[..., 2:] * side, 1e-3) * side))
 
 
 def fit_homography(target: Float64, source: Float64, weights: Float64 | None = None) -> Float64:

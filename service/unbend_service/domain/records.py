@@ -53,6 +53,9 @@ class GridRecord:
         outcome, reason: what was decided.
         strength: share of the estimated correction that is in the grid.
         model: name of the network, empty for grids that came from elsewhere.
+
+    Raises:
+        InvalidGrid: confidence or strength outside 0..1.
     """
 
     grid: Grid
@@ -63,6 +66,11 @@ class GridRecord:
     reason: Reason = Reason.NONE
     strength: float = 1.0
     model: str = ""
+
+    def __post_init__(self) -> None:
+        for name, value in (("confidence", self.confidence), ("strength", self.strength)):
+            if not 0 <= value <= 1:
+                raise InvalidGrid(f"The {name} of a grid is {value!r}.", allowed="0..1")
 
     @property
     def id(self) -> str:

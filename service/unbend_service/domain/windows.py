@@ -45,7 +45,8 @@ class WindowSearch:
     """Looks for windows of one grid.
 
     The search plane is sampled once; a sample is *shown* when its source lies in the picture and the cells around it
-    keep the orientation of the map, so that no window reaches into a part where the continuation folds back.
+    keep the orientation of the map, so that no window reaches into a part where the continuation folds back. Of the
+    shown samples only those count that hang together with the one nearest to the middle.
 
     Raises:
         InvalidGrid: no part of the target shows the source.
@@ -64,9 +65,11 @@ class WindowSearch:
         self._sign = 1.0 if np.median(orientation[touching]) > 0 else -1.0
         kept = np.pad((orientation * self._sign > 0).all(axis=-1), 1, constant_values=True)
         self._source = source
-        self._shown = visible & kept[:-1, :-1] & kept[:-1, 1:] & kept[1:, 1:] & kept[1:, :-1]
-        if not self._shown.any():
+        shown = visible & kept[:-1, :-1] & kept[:-1, 1:] & kept[1:, 1:] & kept[1:, :-1]
+        if not shown.any():
             raise InvalidGrid("No part of the target shows the source.")
+        middle = np.argmin(np.where(shown, (self._points**2).sum(axis=-1), np.inf))
+        self._shown = _connected(shown, (int(middle // _SEARCH_POINTS), int(middle % _SEARCH_POINTS)))
 
     def crop(self) -> Window:
         """The largest window without an invalid point: of the samples first, then grown to the map itself.
@@ -182,6 +185,21 @@ class WindowSearch:
 def within(source: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:
     """(..., 2) centred source points -> (...) whether each lies in the picture."""
     return np.asarray((np.abs(source) <= 1).all(axis=-1))
+
+
+def _connected(mask: npt.NDArray[np.bool_], seed: tuple[int, int]) -> npt.NDArray[np.bool_]:
+    """The part of a (rows, columns) mask that hangs together, side by side, with the true sample ``seed``."""
+    part = np.zeros_like(mask)
+    part[seed] = True
+    count = 1
+    while True:
+        for axis in (0, 1):
+            # Along each run of the mask a member makes all of the run a member: runs are numbered by their gaps.
+            runs = np.cumsum(~mask, axis=axis) + np.expand_dims(np.arange(mask.shape[1 - axis]), axis) * (mask.size + 1)
+            part = mask & np.isin(runs, runs[part])
+        if part.sum() == count:
+            return part
+        count = int(part.sum())
 
 
 def _highest(normals: Float64, slack: Float64) -> Float64:
