@@ -56,11 +56,14 @@ def fit_labels(
     straight = STRAIGHT[:terms]
     fitted = []
     for anchor_at, node_at, value in ((target_y, source_x, source_y), (target_x, source_y, source_x)):
+        # Single precision halves the time, and labels need not be better than the features.
         over_anchors = lagrange_basis(ANCHORS, anchor_at.clip(-1.8, 1.8).ravel()).reshape(size, count, -1)
         over_nodes = lagrange_basis(NODES, node_at.ravel()).reshape(size, count, -1)
+        over_anchors, over_nodes = over_anchors.astype(np.float32), over_nodes.astype(np.float32)
         design = (over_anchors[..., :, None] * over_nodes[..., None, :]).reshape(size, count, terms)
-        weighted = design * weights[..., None]
+        weighted = design * weights.astype(np.float32)[..., None]
         normal = weighted.transpose(0, 2, 1) @ design + ridge * count * np.eye(terms)
-        right = (weighted * (value - design @ straight)[..., None]).sum(1)
+        residual = (value - design @ straight).astype(np.float32)
+        right = (weighted.transpose(0, 2, 1) @ residual[..., None])[..., 0]
         fitted.append(straight + np.linalg.solve(normal, right[..., None])[..., 0])
     return np.concatenate(fitted, 1)

@@ -20,7 +20,7 @@ from torch import Tensor
 from training.checkpoints import Checkpoint
 from training.labels import STRAIGHT, VALUES
 from training.lineset_network import Layout, LinesetNetwork, NetworkShape
-from training.losses import errors, spread_loss, tempered
+from training.losses import Truth, spread_loss, tempered
 from training.random_distortions import KINDS
 from training.sampler import Sampler, TrainingBatch
 from training.warm_start import inherit
@@ -126,9 +126,10 @@ class Run:
         )
         with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.recipe.bfloat16):
             estimates, spreads = self.network.estimates(*packed_input(batch))
+        truth = Truth(source, target, weight, slopes)
         guide_loss = torch.zeros(())
         for values in estimates:
-            overall, nonlinear = errors(values, source, target, weight, slopes)
+            overall, nonlinear = truth.errors(values)
             guide_loss = guide_loss + (tempered(overall) + self.recipe.nonlinear_weight * tempered(nonlinear)).mean()
         spread = spread_loss(spreads, values, labels, self.inverse_basis, overall, nonlinear)
         self.optimiser.zero_grad(set_to_none=True)

@@ -45,56 +45,57 @@ def _node_basis(at: Tensor) -> tuple[Tensor, Tensor]:
     return powers @ matrix, slopes @ matrix
 
 
-def misses(values: Tensor, source: Tensor, target: Tensor) -> Tensor:
-    """Displacement (B, n, 2), px, by which guides with node values (B, 48) miss the source points (B, n, 2) of the
-    targets (B, n, 2)."""
-    size = len(values)
-    half = values.shape[1] // 2
-    rows, columns = values[:, :half].view(size, len(ANCHORS), -1), values[:, half:].view(size, len(ANCHORS), -1)
-    x, y = source.unbind(-1)
-    s, t = target.clamp(-1.8, 1.8).unbind(-1)
-    anchors = ANCHORS.tolist()
-    with torch.no_grad():
-        over_rows, over_columns = _lagrange(anchors, t), _lagrange(anchors, s)
-        at_x, slope_x = _node_basis(x)
-        at_y, slope_y = _node_basis(y)
-    row, column = torch.bmm(over_rows, rows), torch.bmm(over_columns, columns)
-    miss_y = y - (row * at_x).sum(-1)
-    miss_x = x - (column * at_y).sum(-1)
-    with torch.no_grad():
-        row_slope, column_slope = (row * slope_x).sum(-1), (column * slope_y).sum(-1)
-        determinant = (1 - row_slope * column_slope).clamp(min=0.3)
-    dx = (miss_x + column_slope * miss_y) / determinant
-    dy = (row_slope * miss_x + miss_y) / determinant
-    return torch.stack([dx, dy], -1) * PIXELS
+class Truth:
+    """What the losses need of the true correspondences of a batch, computed once for all estimates.
+
+    Args:
+        source, target: (B, n, 2), isotropic frame. weight: (B, n). slopes: (B, n, 2, 2), d source / d target.
+    """
+
+    def __init__(self, source: Tensor, target: Tensor, weight: Tensor, slopes: Tensor) -> None:
+        self._x, self._y = source.unbind(-1)
+        self._share = weight / weight.sum(1, keepdim=True).clamp(min=1e-3)
+        bounded = target.clamp(-1.8, 1.8)
+        s, t = bounded.unbind(-1)
+        self._over_rows, self._over_columns = _lagrange(ANCHORS.tolist(), t), _lagrange(ANCHORS.tolist(), s)
+        self._at_x, self._slope_x = _node_basis(self._x)
+        self._at_y, self._slope_y = _node_basis(self._y)
+        self._tangents = _homography_tangents(s, t, slopes)
+        weighted = self._tangents * torch.cat([self._share, self._share], 1)[..., None]
+        normal = weighted.transpose(1, 2) @ self._tangents + 1e-5 * torch.eye(8)
+        self._project = torch.linalg.solve(normal, weighted.transpose(1, 2))
+
+    def misses(self, values: Tensor) -> Tensor:
+        """Displacement (B, 2 n), px, x then y, by which guides with node values (B, 48) miss the source points."""
+        half = values.shape[1] // 2
+        rows = torch.bmm(self._over_rows, values[:, :half].reshape(len(values), len(ANCHORS), -1))
+        columns = torch.bmm(self._over_columns, values[:, half:].reshape(len(values), len(ANCHORS), -1))
+        miss_y = self._y - (rows * self._at_x).sum(-1)
+        miss_x = self._x - (columns * self._at_y).sum(-1)
+        with torch.no_grad():
+            row_slope, column_slope = (rows * self._slope_x).sum(-1), (columns * self._slope_y).sum(-1)
+            scale = PIXELS / (1 - row_slope * column_slope).clamp(min=0.3)
+        return torch.cat([(miss_x + column_slope * miss_y) * scale, (row_slope * miss_x + miss_y) * scale], 1)
+
+    def errors(self, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean first-order error of each sample, of all (B,) and of the nonlinear part (B,), px."""
+        missed = self.misses(values)
+        plane = (self._tangents @ (self._project @ missed[..., None]))[..., 0]
+        return self._mean_length(missed), self._mean_length(missed - plane)
+
+    def _mean_length(self, displacement: Tensor) -> Tensor:
+        dx, dy = displacement.chunk(2, 1)
+        return (torch.sqrt(dx * dx + dy * dy + 1e-4) * self._share).sum(1)
 
 
-def homography_tangents(target: Tensor, slopes: Tensor) -> Tensor:
+def _homography_tangents(s: Tensor, t: Tensor, slopes: Tensor) -> Tensor:
     """Source displacements (B, 2 n, 8) that the eight infinitesimal homographies of the target cause, x then y."""
-    s, t = target.clamp(-1.8, 1.8).unbind(-1)
     zero, one = torch.zeros_like(s), torch.ones_like(s)
     in_s = torch.stack([one, zero, s, zero, t, zero, s * s, s * t], -1)
     in_t = torch.stack([zero, one, zero, s, zero, t, s * t, t * t], -1)
     dx = slopes[..., 0, 0, None] * in_s + slopes[..., 0, 1, None] * in_t
     dy = slopes[..., 1, 0, None] * in_s + slopes[..., 1, 1, None] * in_t
     return torch.cat([dx, dy], 1)
-
-
-def errors(values: Tensor, source: Tensor, target: Tensor, weight: Tensor, slopes: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean first-order error of each sample, of all (B,) and of the nonlinear part (B,), px."""
-    missed = misses(values, source, target)
-    share = weight / weight.sum(1, keepdim=True).clamp(min=1e-3)
-    overall = (torch.sqrt((missed**2).sum(-1) + 1e-4) * share).sum(1)
-    with torch.no_grad():
-        tangents = homography_tangents(target, slopes)
-        weighted = tangents * torch.cat([share, share], 1)[..., None]
-        normal = weighted.transpose(1, 2) @ tangents + 1e-5 * torch.eye(8)
-        project = torch.linalg.solve(normal, weighted.transpose(1, 2))
-    flat = torch.cat([missed[..., 0], missed[..., 1]], 1)
-    rest = flat - (tangents @ (project @ flat[..., None]))[..., 0]
-    count = source.shape[1]
-    nonlinear = (torch.sqrt(rest[:, :count] ** 2 + rest[:, count:] ** 2 + 1e-4) * share).sum(1)
-    return overall, nonlinear
 
 
 def tempered(error: Tensor) -> Tensor:
