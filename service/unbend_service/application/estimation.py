@@ -6,10 +6,12 @@ import dataclasses
 
 from unbend_service.application.blocking import BlockingWork
 from unbend_service.application.fitting import FittedGrids
+from unbend_service.application.grey import grey_of_frame
 from unbend_service.application.ports import Bytes, Estimate, Estimator, GridStore, ImageCodec, Meter
 from unbend_service.domain.decision import decide
 from unbend_service.domain.errors import InvalidOption
 from unbend_service.domain.fit import KEEP, Fit
+from unbend_service.domain.frames import Frame
 from unbend_service.domain.records import Correct, GridRecord
 
 #: Longer side to which pictures are reduced before an estimator sees them.
@@ -83,6 +85,18 @@ class Estimation:
             EmptyBody, UnsupportedMediaType, InvalidImage, TooManyPixels, InvalidOption, QueueFull.
         """
         grey = await self._blocking.run("decode", self._codec.decode_grey, body, ESTIMATE_LONGEST_PX)
+        return await self.of_grey_described(grey, correct, fit, strength, min_confidence)
+
+    async def of_frame(
+        self,
+        frame: Frame,
+        correct: Correct = Correct.NONLINEAR,
+        fit: Fit = KEEP,
+        strength: float = 1.0,
+        min_confidence: float | None = None,
+    ) -> GridRecord:
+        """As :meth:`of_image`, for a raw picture."""
+        grey = await self._blocking.run("decode", grey_of_frame, frame, ESTIMATE_LONGEST_PX)
         return await self.of_grey_described(grey, correct, fit, strength, min_confidence)
 
     async def of_grey_described(

@@ -1,0 +1,141 @@
+"""``unbend.v1.CorrectionService``: one picture, or a stream of frames."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from dataclasses import replace
+
+from unbend.v1 import correction_pb2, correction_pb2_grpc, frame_pb2
+from unbend_service.application.correction import Correction
+from unbend_service.application.stream_messages import (
+    DrawnGuides,
+    EncodedFormat,
+    EstimateOver,
+    GridFixed,
+    GridSource,
+    RawFormat,
+    StoredGrid,
+    StreamConfig,
+    StreamEvent,
+    StreamFrame,
+)
+from unbend_service.application.streams import Streams
+from unbend_service.domain.errors import InvalidOption, ProtocolViolation
+from unbend_service.domain.frames import PixelFormat
+from unbend_service.settings import Settings
+from unbend_service.transport.rpc.calls import Context
+from unbend_service.transport.rpc.convert import (
+    ENCODED_FORMATS,
+    from_record,
+    from_result,
+    to_delivery,
+    to_format,
+    to_frame,
+    to_guides,
+    to_options,
+    to_while_estimating,
+)
+from unbend_service.transport.rpc.pictures import check_body, check_pixels
+
+Request = correction_pb2.CorrectStreamRequest
+Response = correction_pb2.CorrectStreamResponse
+
+
+class CorrectionServicer(correction_pb2_grpc.CorrectionServiceServicer):
+    """Straightens raw and encoded pictures, and streams of them."""
+
+    def __init__(self, correction: Correction, streams: Streams, settings: Settings) -> None:
+        self._correction = correction
+        self._streams = streams
+        self._settings = settings
+
+    async def Correct(  # noqa: N802 the name of the generated base class
+        self, request: correction_pb2.CorrectRequest, context: Context
+    ) -> correction_pb2.CorrectResponse:
+        layout = to_format(request.format.pixel_format)
+        min_confidence = request.min_confidence if request.HasField("min_confidence") else None
+        options = to_options(request.correct, request.rendering, min_confidence)
+        options = replace(options, grid_id=request.grid_id or None)
+        if isinstance(layout, PixelFormat):
+            if request.answer_format not in (frame_pb2.PIXEL_FORMAT_UNSPECIFIED, request.format.pixel_format):
+                raise InvalidOption("A raw picture comes back in its own format.", allowed="no answer_format")
+            check_pixels(request.format.width, request.format.height, self._settings.source_pixels)
+            frame = to_frame(layout, request.format.width, request.format.height, request.data)
+            corrected = await self._correction.of_frame(frame, options)
+            return correction_pb2.CorrectResponse(
+                format=request.format,
+                data=corrected.frame.data.tobytes(),
+                record=from_record(corrected.record, whole=False),
+            )
+        answer_format = request.answer_format or request.format.pixel_format
+        if answer_format not in ENCODED_FORMATS:
+            raise InvalidOption(
+                "A file comes back as a file.", allowed=f"an answer_format of {', '.join(ENCODED_FORMATS.values())}"
+            )
+        body = check_body(request.data, self._settings.body_bytes)
+        image = await self._correction.of_image(body, replace(options, image_format=ENCODED_FORMATS[answer_format]))
+        return correction_pb2.CorrectResponse(
+            format=frame_pb2.FrameFormat(pixel_format=answer_format),
+            data=image.body,
+            record=from_record(image.record, whole=False),
+        )
+
+    async def CorrectStream(  # type: ignore[override] # noqa: N802 writes instead of yielding: a write can be ended
+        self, requests: AsyncIterator[Request], context: Context
+    ) -> None:
+        config = await self._opening(requests)
+        async with self._streams.open(config) as session:
+            opened = correction_pb2.StreamOpened(
+                stream_id=session.stream_id, resumed=session.resumed, max_in_flight=session.max_in_flight
+            )
+            await context.write(Response(opened=opened))
+            async for event in session.run(_frames(requests)):
+                await context.write(_response(event))
+
+    async def _opening(self, requests: AsyncIterator[Request]) -> StreamConfig:
+        async for request in requests:
+            if request.WhichOneof("message") != "open":
+                break
+            return to_config(request.open)
+        raise ProtocolViolation("A stream begins with its open message.", allowed="open, then frames")
+
+
+def to_config(message: correction_pb2.StreamOpen) -> StreamConfig:
+    """How a stream is to be treated. Raises InvalidOption, InvalidGuides, UnsupportedPixelFormat."""
+    layout = to_format(message.format.pixel_format)
+    min_confidence = message.min_confidence if message.HasField("min_confidence") else None
+    return StreamConfig(
+        frame_format=RawFormat(layout, message.format.width, message.format.height)
+        if isinstance(layout, PixelFormat)
+        else EncodedFormat(layout),
+        stream_id=message.stream_id,
+        options=to_options(message.correct, message.rendering, min_confidence),
+        grid_source=_grid_source(message),
+        while_estimating=to_while_estimating(message.while_estimating),
+        delivery=to_delivery(message.delivery),
+        estimate_again=message.estimate_again,
+    )
+
+
+def _grid_source(message: correction_pb2.StreamOpen) -> GridSource:
+    match message.WhichOneof("grid_source"):
+        case "grid_id":
+            return StoredGrid(message.grid_id)
+        case "guides":
+            return DrawnGuides(to_guides(message.guides))
+        case _:
+            return EstimateOver(message.estimate.frames or None)
+
+
+async def _frames(requests: AsyncIterator[Request]) -> AsyncIterator[StreamFrame]:
+    async for request in requests:
+        if request.WhichOneof("message") != "frame":
+            raise ProtocolViolation("A stream is opened once.", allowed="open, then frames")
+        frame = request.frame
+        yield StreamFrame(frame.index, frame.timestamp_us, frame.data)
+
+
+def _response(event: StreamEvent) -> Response:
+    if isinstance(event, GridFixed):
+        return Response(grid=correction_pb2.StreamGrid(record=from_record(event.record, whole=False)))
+    return Response(result=from_result(event))
