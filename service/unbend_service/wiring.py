@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 
 from unbend_service.adapters.codecs.pillow import PillowCodec
+from unbend_service.adapters.drawing.overlay import OverlayIllustrator
 from unbend_service.adapters.estimators.catalogue import load_estimator
 from unbend_service.adapters.grid_stores.memory import MemoryGridStore
 from unbend_service.adapters.grid_stores.sqlite import SqliteGridStore
@@ -15,6 +16,7 @@ from unbend_service.application.correction import Correction
 from unbend_service.application.estimation import Estimation
 from unbend_service.application.fitting import FittedGrids
 from unbend_service.application.grids import GridLibrary
+from unbend_service.application.illustration import Illustration
 from unbend_service.application.ports import GridStore
 from unbend_service.application.service import Service
 from unbend_service.application.streams import Streams
@@ -67,6 +69,11 @@ def build_service(settings: Settings, meter: PrometheusMeter | None = None) -> S
         jpeg_quality=settings.jpeg_quality,
         deadline_s=settings.render_deadline_s,
     )
+    illustration = Illustration(
+        estimation, codec, store, OverlayIllustrator(), blocking, jpeg_quality=settings.jpeg_quality
+    )
     grids = GridLibrary(store, grid_points=settings.grid_points)
     streams = Streams(estimation, correction, store, codec, blocking, meter, settings)
-    return Service(estimation, correction, grids, streams, pool, store, codec, meter, blocking, estimator.model)
+    return Service(
+        estimation, correction, illustration, grids, streams, pool, store, codec, meter, blocking, estimator.model
+    )

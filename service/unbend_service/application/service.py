@@ -10,6 +10,7 @@ from unbend_service.application.blocking import BlockingWork
 from unbend_service.application.correction import Correction
 from unbend_service.application.estimation import Estimation
 from unbend_service.application.grids import GridLibrary
+from unbend_service.application.illustration import Illustration
 from unbend_service.application.ports import GridStore, ImageCodec, Meter, ModelInfo, PoolState, RenderPool
 from unbend_service.application.streams import Streams
 
@@ -40,6 +41,7 @@ class Service:
 
     estimation: Estimation
     correction: Correction
+    illustration: Illustration
     grids: GridLibrary
     streams: Streams
     pool: RenderPool

@@ -1,0 +1,107 @@
+"""What happens around every request: its id, the access log, the metrics, and the last catch of all errors."""
+
+from __future__ import annotations
+
+import re
+import time
+import uuid
+
+import structlog
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from unbend_service.application.admission import Admission
+from unbend_service.application.ports import Meter
+from unbend_service.domain.errors import Draining
+from unbend_service.transport.rest import problems
+
+REQUEST_ID_HEADER = "X-Request-Id"
+_ACCEPTED_ID = re.compile(r"[A-Za-z0-9._:-]{1,128}")
+_KNOWN_METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "DELETE", "OPTIONS", "PATCH"})
+#: Probes and scrapes come every few seconds; they are logged at debug level only.
+_QUIET_PATHS = frozenset({"/livez", "/readyz", "/metrics"})
+
+_log = structlog.get_logger("unbend.http")
+
+
+class Accounting:
+    """ASGI middleware, outermost.
+
+    Accepts ``X-Request-Id`` or makes one, logs and counts each request once it is answered, and turns what nobody
+    caught into a 500 that says nothing but the request id.
+    """
+
+    def __init__(self, app: ASGIApp, meter: Meter) -> None:
+        self._app = app
+        self._meter = meter
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        request_id = _request_id(scope)
+        scope.setdefault("state", {})["request_id"] = request_id
+        status = 0
+        started = time.perf_counter()
+
+        async def send_with_id(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                MutableHeaders(scope=message)[REQUEST_ID_HEADER] = request_id
+            await send(message)
+
+        with structlog.contextvars.bound_contextvars(request_id=request_id):
+            try:
+                await self._app(scope, receive, send_with_id)
+            except Exception:
+                _log.exception("request failed", method=scope["method"], path=scope["path"])
+                if status:
+                    raise  # the answer is half sent; only the server can cut the connection
+                await problems.respond_internal(request_id)(scope, receive, send_with_id)
+            finally:
+                self._account(scope, status or 500, time.perf_counter() - started)
+
+    def _account(self, scope: Scope, status: int, seconds: float) -> None:
+        self._meter.request("http", _label(scope), str(status), seconds)
+        write = _log.debug if scope["path"] in _QUIET_PATHS else _log.info
+        write(
+            "request",
+            method=scope["method"],
+            path=scope["path"],
+            status=status,
+            seconds=round(seconds, 4),
+            client=(scope.get("client") or ("",))[0],
+        )
+
+
+class Admitting:
+    """ASGI middleware: calls of the API are let in one by one, so that a draining service can refuse new ones."""
+
+    def __init__(self, app: ASGIApp, admission: Admission, meter: Meter) -> None:
+        self._app = app
+        self._admission = admission
+        self._meter = meter
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http" or not scope["path"].startswith("/v1/"):
+            await self._app(scope, receive, send)
+            return
+        try:
+            with self._admission.admitted():
+                await self._app(scope, receive, send)
+        except Draining as error:
+            self._meter.rejected(error.code)
+            await problems.respond_to(error, scope["state"]["request_id"])(scope, receive, send)
+
+
+def _request_id(scope: Scope) -> str:
+    offered = Headers(scope=scope).get(REQUEST_ID_HEADER, "")
+    return offered if _ACCEPTED_ID.fullmatch(offered) else uuid.uuid4().hex
+
+
+def _label(scope: Scope) -> str:
+    """``POST /v1/correct``: the route's own path, so that ids and made-up paths do not become labels."""
+    method = scope["method"] if scope["method"] in _KNOWN_METHODS else "OTHER"
+    path = getattr(scope.get("route"), "path", None)
+    return f"{method} {path or 'other'}"

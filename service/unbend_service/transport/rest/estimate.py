@@ -1,0 +1,45 @@
+"""POST /v1/estimate."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Request, Response
+
+from unbend_service.application.service import Service
+from unbend_service.domain import errors
+from unbend_service.domain.fit import Fit
+from unbend_service.domain.records import Correct
+from unbend_service.settings import Settings
+from unbend_service.transport.rest import parameters, problems
+from unbend_service.transport.rest.bodies import IMAGE_REQUEST_BODY, read_image
+from unbend_service.transport.rest.correct import IMAGE_ERRORS
+from unbend_service.transport.rest.provenance import GridRecordBody, json_of
+
+
+def router(service: Service, settings: Settings) -> APIRouter:
+    """The route over ``service``."""
+    routes = APIRouter()
+
+    @routes.post(
+        "/v1/estimate",
+        summary="Estimate the distortion of a picture",
+        response_class=Response,
+        responses={
+            200: {"model": GridRecordBody, "description": "The grid that straightens the picture, and its guides."},
+            **problems.responses(*IMAGE_ERRORS, errors.InvalidGrid, errors.FoldedGrid, errors.InvalidGuides),
+        },
+        openapi_extra={"requestBody": IMAGE_REQUEST_BODY},
+    )
+    async def estimate(
+        request: Request,
+        correct: parameters.CorrectQuery = Correct.NONLINEAR,
+        fit: parameters.FitQuery = "keep",
+        strength: parameters.StrengthQuery = 1.0,
+        min_confidence: parameters.ConfidenceQuery = None,
+    ) -> Response:
+        """Send the image file. The grid that comes back, and is stored under `grid_id`, is the one that `correct`,
+        `fit` and `strength` describe; the guides are as estimated."""
+        wanted = Fit.parse(fit)
+        body = await read_image(request, settings.body_bytes)
+        return json_of(await service.estimation.of_image(body, correct, wanted, strength, min_confidence))
+
+    return routes

@@ -1,0 +1,157 @@
+"""/v1/grids: the grid library."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import orjson
+from fastapi import APIRouter, Query, Request, Response
+
+from unbend_service.application.exports import MAX_MAP_PIXELS, npz_of_maps
+from unbend_service.application.service import Service
+from unbend_service.domain import errors
+from unbend_service.settings import Settings
+from unbend_service.transport.rest import parameters, problems
+from unbend_service.transport.rest.bodies import read_body
+from unbend_service.transport.rest.provenance import GridBody, GridRecordBody, GuidesBody, json_of
+
+_MAP_SIDE_PX = 1 << 16
+WidthQuery = Annotated[
+    int | None,
+    Query(ge=1, le=_MAP_SIDE_PX, description=f"Of the npz maps, with height; {MAX_MAP_PIXELS} pixels in all at most."),
+]
+_UPLOAD: dict[str, Any] = {
+    "required": True,
+    "description": "`grid`, with whatever else an estimate says of it; or `guides` alone, and the grid is spun here.",
+    "content": {
+        "application/json": {
+            "schema": {
+                "type": "object",
+                "properties": {
+                    "grid": {"$ref": "#/components/schemas/GridBody"},
+                    "guides": {"$ref": "#/components/schemas/GuidesBody"},
+                },
+                "anyOf": [{"required": ["grid"]}, {"required": ["guides"]}],
+            }
+        }
+    },
+}
+_UPLOAD_ERRORS = (
+    errors.BodyTooLarge,
+    errors.InvalidGrid,
+    errors.FoldedGrid,
+    errors.InvalidGuides,
+    errors.QueueFull,
+    errors.Unavailable,
+)
+#: Named in OpenAPI though no route takes them as parsed models: large grids are parsed by orjson alone.
+COMPONENTS = (GridBody, GuidesBody)
+
+
+def router(service: Service, settings: Settings) -> APIRouter:
+    """The routes over ``service``."""
+    routes = APIRouter(prefix="/v1/grids")
+
+    async def read_json(request: Request) -> Any:
+        body = await read_body(request, settings.body_bytes)
+        try:
+            return await service.blocking.run("grid", orjson.loads, body)
+        except orjson.JSONDecodeError as error:
+            raise errors.InvalidGrid(
+                f"The body is not JSON: {error}.", allowed="RFC 8259 JSON, which has neither NaN nor Infinity"
+            ) from error
+
+    @routes.post(
+        "",
+        summary="Store a grid",
+        status_code=201,
+        response_class=Response,
+        responses={
+            201: {"model": GridRecordBody, "description": "Stored; Location says where."},
+            **problems.responses(*_UPLOAD_ERRORS),
+        },
+        openapi_extra={"requestBody": _UPLOAD},
+    )
+    async def post(request: Request) -> Response:
+        """The id is computed from the content."""
+        record = await service.grids.put(await read_json(request))
+        return json_of(record, 201, {"Location": f"/v1/grids/{record.id}"})
+
+    @routes.put(
+        "/{grid_id}",
+        summary="Store a grid whose id is known",
+        response_class=Response,
+        responses={
+            200: {"model": GridRecordBody, "description": "Stored."},
+            **problems.responses(*_UPLOAD_ERRORS, errors.GridConflict),
+        },
+        openapi_extra={"requestBody": _UPLOAD},
+    )
+    async def put(request: Request, grid_id: parameters.GridIdPath) -> Response:
+        """The id must be that of the content: what was fetched from one service can be put into another."""
+        return json_of(await service.grids.put(await read_json(request), grid_id))
+
+    @routes.get(
+        "/{grid_id}",
+        summary="Fetch a grid",
+        response_class=Response,
+        responses={
+            200: {"model": GridRecordBody, "description": "The grid and its provenance."},
+            **problems.responses(errors.GridNotFound, errors.Unavailable),
+        },
+    )
+    async def get(grid_id: parameters.GridIdPath) -> Response:
+        """As it was estimated or stored."""
+        return json_of(await service.grids.get(grid_id))
+
+    @routes.delete(
+        "/{grid_id}",
+        summary="Forget a grid",
+        status_code=204,
+        response_class=Response,
+        responses=problems.responses(errors.GridNotFound, errors.Unavailable),
+    )
+    async def delete(grid_id: parameters.GridIdPath) -> Response:
+        """Streams that were given it estimate anew when they are resumed."""
+        await service.grids.delete(grid_id)
+        return Response(status_code=204)
+
+    @routes.get(
+        "/{grid_id}/export",
+        summary="Export a grid",
+        response_class=Response,
+        responses={
+            200: {
+                "description": "The file.",
+                "content": {
+                    "application/json": {"schema": {"$ref": "#/components/schemas/GridRecordBody"}},
+                    "application/zip": {"schema": {"type": "string", "format": "binary"}},
+                },
+            },
+            **problems.responses(errors.GridNotFound, errors.InvalidOption, errors.QueueFull, errors.Unavailable),
+        },
+    )
+    async def export(
+        grid_id: parameters.GridIdPath,
+        format: Annotated[
+            Literal["json", "npz"],
+            Query(description="`json`: the record; `npz`: `map_x` and `map_y` for cv2.remap, float32 source pixels."),
+        ] = "json",
+        width: WidthQuery = None,
+        height: WidthQuery = None,
+    ) -> Response:
+        """For programs that do not speak grids."""
+        record = await service.grids.get(grid_id)
+        if format == "json":
+            return json_of(record, headers=_attachment(f"{record.id}.json"))
+        if width is None or height is None:
+            raise errors.InvalidOption("npz maps have a size.", allowed="width and height in pixels")
+        archive = await service.blocking.run("grid", npz_of_maps, record.grid, width, height)
+        headers = _attachment(f"{record.id}-{width}x{height}.npz")
+        return Response(archive, media_type="application/zip", headers=headers)
+
+    return routes
+
+
+def _attachment(name: str) -> dict[str, str]:
+    return {"Content-Disposition": f'attachment; filename="{name}"'}
