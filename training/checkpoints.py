@@ -45,7 +45,8 @@ class Checkpoint:
         """The network with averaged parameters, ready to be asked."""
         network = LinesetNetwork(self.shape)
         network.load_state_dict(self.average)
-        return network.eval()
+        network.eval()
+        return network
 
     def restored_generator(self) -> np.random.Generator:
         generator = np.random.default_rng()

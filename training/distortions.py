@@ -20,6 +20,7 @@ one vectorised code path serve them all.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +29,8 @@ Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
+Floats = npt.NDArray[Any]
+"""float64 for a few points per sample, float32 for the many of all chains."""
 
 TABLE_SIZE = 384
 TABLE_REACH = 2.6
@@ -93,7 +96,7 @@ class DistortionBatch:
         has an image at all (it may lie behind the camera, or past the fold of a lens).
         """
         x, y = self._oriented(x, y, sample, before=True)
-        x, y, visible = _project(np.linalg.inv(self.homography), x, y, sample)
+        x, y, visible = _project(np.asarray(np.linalg.inv(self.homography), np.float64), x, y, sample)
         centre_x, centre_y = (self.centre[:, i].astype(np.float32)[sample] for i in (0, 1))
         dx, dy = x - centre_x, y - centre_y
         radius = np.hypot(dx, dy)
@@ -110,9 +113,7 @@ class DistortionBatch:
         x, y = self._oriented(x, y, sample, before=False)
         return x.astype(np.float32), y.astype(np.float32), visible
 
-    def _oriented(
-        self, x: npt.NDArray[np.floating], y: npt.NDArray[np.floating], at: object, *, before: bool
-    ) -> tuple[npt.NDArray[np.floating], npt.NDArray[np.floating]]:
+    def _oriented(self, x: Floats, y: Floats, at: Any, *, before: bool) -> tuple[Floats, Floats]:
         """The mirrors and transposition, or (before=False) their inverse."""
         sign_x = np.where(self.mirror_x, -1, 1).astype(x.dtype)[at]
         sign_y = np.where(self.mirror_y, -1, 1).astype(x.dtype)[at]
@@ -125,20 +126,16 @@ class DistortionBatch:
         return x, y
 
 
-def _tangential(
-    x: npt.NDArray[np.floating], y: npt.NDArray[np.floating], p1: npt.NDArray[np.floating], p2: npt.NDArray[np.floating]
-) -> tuple[npt.NDArray[np.floating], npt.NDArray[np.floating]]:
+def _tangential(x: Floats, y: Floats, p1: Floats, p2: Floats) -> tuple[Floats, Floats]:
     """Brown (1966): dx = 2 p1 x y + p2 (r^2 + 2 x^2), dy = p1 (r^2 + 2 y^2) + 2 p2 x y; undistorted x, y."""
     square = np.minimum(x * x + y * y, 4)
     return 2 * p1 * x * y + p2 * (square + 2 * x * x), p1 * (square + 2 * y * y) + 2 * p2 * x * y
 
 
-def _project(
-    matrices: Float64, x: npt.NDArray[np.floating], y: npt.NDArray[np.floating], at: object
-) -> tuple[npt.NDArray[np.floating], npt.NDArray[np.floating], Bools]:
+def _project(matrices: Float64, x: Floats, y: Floats, at: Any) -> tuple[Floats, Floats, Bools]:
     entries = (matrices / matrices[:, 2:, 2:]).astype(x.dtype)
 
-    def entry(row: int, column: int) -> npt.NDArray[np.floating]:
+    def entry(row: int, column: int) -> Floats:
         return np.asarray(entries[:, row, column][at])
 
     depth = entry(2, 0) * x + entry(2, 1) * y + 1

@@ -12,6 +12,8 @@ Output: 48 node values (see `labels`), isotropic frame, as coefficients of a fix
 straight guides; and, from a head whose gradient stops at its input, log scales of their errors.
 """
 
+# mypy: disallow-subclassing-any=False
+# (types are also checked where torch is not installed, and its modules are Any)
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass

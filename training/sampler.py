@@ -52,6 +52,18 @@ class TrainingBatch:
     kind: Ints
 
 
+@dataclass(frozen=True)
+class _Windows:
+    """How stored chains become a sample's: entry (B,) of the store; isotropic picture coordinates times scale (B,)
+    plus shift (B, 2) are isotropic target coordinates; pixel (B,), isotropic size of a searched pixel."""
+
+    entry: Ints
+    scale_x: Float32
+    scale_y: Float32
+    shift: Float32
+    pixel: Float32
+
+
 class Sampler:
     """Draws batches from a store; all randomness comes from the generator passed in."""
 
@@ -98,55 +110,50 @@ class Sampler:
         return np.stack([np.where(portrait, short, 1.0), np.where(portrait, 1.0, short)], 1)
 
     def _points(self, distortions: DistortionBatch, half_extent: Float64, rng: np.random.Generator) -> ChainPoints:
-        size = distortions.size
         low, high = _target_bounds(distortions, half_extent)
-        picture = self._pick(size, rng)
-        width, height = self._store.size_px[picture].T
-        span = high - low
-        # Photograph pixels per isotropic unit of the target frame, at which the needed window just fits the picture.
-        fitting = np.minimum((width - 2) / span[:, 0], (height - 2) / span[:, 1])
-        floor = np.minimum(fitting, COARSEST_ZOOM * 128)
-        zoom = fitting * (floor / fitting) ** rng.random(size)
-        searched = np.where(
-            rng.random(size) < 0.5, SEARCHED_LONG_SIDE_PX[0], np.exp(rng.uniform(*np.log(SEARCHED_LONG_SIDE_PX), size))
-        )
-        wanted_level = searched / 2 / zoom * np.exp(0.12 * rng.normal(size=size))
-        level = np.abs(np.log(wanted_level[:, None] / np.array(LEVELS))).argmin(1)
-        half_long = np.maximum(width, height) / 2
-        # Window corner, as an offset from the picture's centre, in photograph pixels.
-        corner = np.stack(
-            [
-                -width / 2 + 1 + rng.random(size) * (width - 2 - zoom * span[:, 0]),
-                -height / 2 + 1 + rng.random(size) * (height - 2 - zoom * span[:, 1]),
-            ],
-            1,
-        )
-        scale = half_long / zoom
-        shift = low - corner / zoom[:, None]
-        mirrored = np.where(rng.random(size) < 0.5, -1.0, 1.0)
-        x, y, strength, starts, sample = self._gather(picture * len(LEVELS) + level)
-        x = x * (mirrored * scale).astype(np.float32)[sample] + shift[:, 0].astype(np.float32)[sample]
-        y = y * scale.astype(np.float32)[sample] + shift[:, 1].astype(np.float32)[sample]
-        margin = _SEE_MARGIN
-        near = (
-            (x > (low[:, 0] - margin).astype(np.float32)[sample])
-            & (x < (high[:, 0] + margin).astype(np.float32)[sample])
-            & (y > (low[:, 1] - margin).astype(np.float32)[sample])
-            & (y < (high[:, 1] + margin).astype(np.float32)[sample])
-        )
+        windows = self._windows(low, high, rng)
+        x, y, strength, starts, sample = self._gather(windows.entry)
+        x = x * windows.scale_x[sample] + windows.shift[sample, 0]
+        y = y * windows.scale_y[sample] + windows.shift[sample, 1]
+        low, high = (low - _SEE_MARGIN).astype(np.float32), (high + _SEE_MARGIN).astype(np.float32)
+        near = (x > low[sample, 0]) & (x < high[sample, 0]) & (y > low[sample, 1]) & (y < high[sample, 1])
         x, y, strength, sample, starts = _kept(near, x, y, strength, sample, starts)
-        x, y = _tilted(natural_tilts(size, self._tilt_share, rng), x, y, sample)
+        x, y = _tilted(natural_tilts(distortions.size, self._tilt_share, rng), x, y, sample)
         x, y, visible = distortions.bend(x, y, sample)
-        pixel = 2.0 / searched
         visible &= _extracted(x, y, strength, starts, sample, half_extent, rng)
-        jitter = np.where(rng.random(size) < 0.7, rng.random(size) * 0.12, rng.random(size) * 0.35) * pixel
-        jitter = jitter.astype(np.float32)[sample]
+        jitter = _jitter(windows.pixel, rng)[sample]
         x = x + jitter * rng.standard_normal(len(x), dtype=np.float32)
         y = y + jitter * rng.standard_normal(len(x), dtype=np.float32)
-        inner = (half_extent - UNSEARCHED_BORDER_PX * pixel[:, None]).astype(np.float32)
+        inner = half_extent.astype(np.float32) - np.float32(UNSEARCHED_BORDER_PX) * windows.pixel[:, None]
         visible &= (np.abs(x) < inner[sample, 0]) & (np.abs(y) < inner[sample, 1])
         x, y, strength, sample, starts = _kept(visible, x, y, strength, sample, starts)
-        return ChainPoints(x, y, strength, starts, sample, half_extent.astype(np.float32), pixel.astype(np.float32))
+        return ChainPoints(x, y, strength, starts, sample, half_extent.astype(np.float32), windows.pixel)
+
+    def _windows(self, low: Float64, high: Float64, rng: np.random.Generator) -> _Windows:
+        """Where in which picture each sample looks, so that it sees the target rectangle low..high (B, 2)."""
+        size = len(low)
+        picture = self._pick(size, rng)
+        extent_px = self._store.size_px[picture]
+        span = high - low
+        # Picture pixels per isotropic unit of the target frame, at which the needed rectangle just fits the picture.
+        fitting = ((extent_px - 2) / span).min(1)
+        floor = np.minimum(fitting, COARSEST_ZOOM * 128)
+        zoom = fitting * (floor / fitting) ** rng.random(size)
+        smallest, largest = SEARCHED_LONG_SIDE_PX
+        varied = smallest * (largest / smallest) ** rng.random(size)
+        searched = np.where(rng.random(size) < 0.5, smallest, varied)
+        wanted_level = searched / 2 / zoom * np.exp(0.12 * rng.normal(size=size))
+        level = np.abs(np.log(wanted_level[:, None] / np.array(LEVELS))).argmin(1)
+        corner_px = 1 - extent_px / 2 + rng.random((size, 2)) * (extent_px - 2 - zoom[:, None] * span)
+        scale = extent_px.max(1) / 2 / zoom
+        mirrored = np.where(rng.random(size) < 0.5, -1, 1)
+        return _Windows(
+            entry=picture * len(LEVELS) + level,
+            scale_x=(scale * mirrored).astype(np.float32),
+            scale_y=scale.astype(np.float32),
+            shift=(low - corner_px / zoom[:, None]).astype(np.float32),
+            pixel=(2 / searched).astype(np.float32),
+        )
 
     def _pick(self, size: int, rng: np.random.Generator) -> Ints:
         if not len(self._drawn):
@@ -199,6 +206,12 @@ def _tilted(tilts: Float64, x: Float32, y: Float32, sample: Ints) -> tuple[Float
     depth = np.maximum(entries[sample, 2, 0] * x + entries[sample, 2, 1] * y + entries[sample, 2, 2], np.float32(0.2))
     tilted_x = (entries[sample, 0, 0] * x + entries[sample, 0, 1] * y + entries[sample, 0, 2]) / depth
     return tilted_x, (entries[sample, 1, 0] * x + entries[sample, 1, 1] * y + entries[sample, 1, 2]) / depth
+
+
+def _jitter(pixel: Float32, rng: np.random.Generator) -> Float32:
+    """Standard deviation (B,) of the noise added to each coordinate, isotropic; mostly small."""
+    share = np.where(rng.random(len(pixel)) < 0.7, 0.12, 0.35) * rng.random(len(pixel))
+    return (share * pixel).astype(np.float32)
 
 
 def _extracted(

@@ -122,4 +122,4 @@ def _writing(texture: Float32, rng: np.random.Generator) -> Float32:
             cv2.LINE_AA,
         )
     cover = ink.astype(np.float32) / 255
-    return texture * (1 - cover) + np.float32(tone) * cover
+    return np.asarray(texture * (1 - cover) + np.float32(tone) * cover, np.float32)

@@ -102,8 +102,8 @@ def _nothing() -> _Points:
 def _trace(grey: npt.NDArray[np.uint8]) -> _Points | None:
     """Every pixel of every chain, ordered, with its sub-pixel position in pixel index coordinates."""
     smooth = cv2.GaussianBlur(grey, (0, 0), 1.0).astype(np.float32)
-    gradient_x = cv2.Scharr(smooth, cv2.CV_32F, 1, 0)
-    gradient_y = cv2.Scharr(smooth, cv2.CV_32F, 0, 1)
+    gradient_x = np.asarray(cv2.Scharr(smooth, cv2.CV_32F, 1, 0), np.float32)
+    gradient_y = np.asarray(cv2.Scharr(smooth, cv2.CV_32F, 0, 1), np.float32)
     magnitude = np.asarray(cv2.magnitude(gradient_x, gradient_y), np.float32)
     edges = _simple_edges(gradient_x, gradient_y, magnitude)
     columns, rows, chain, along = _ordered_pixels(edges)
@@ -116,7 +116,7 @@ def _trace(grey: npt.NDArray[np.uint8]) -> _Points | None:
 
 
 def _simple_edges(
-    gradient_x: npt.NDArray[np.float32], gradient_y: npt.NDArray[np.float32], magnitude: FloatArray
+    gradient_x: FloatArray, gradient_y: FloatArray, magnitude: FloatArray
 ) -> BoolArray:
     """Canny edges in which no pixel has more than two neighbours: bool (h, w)."""
     strong = max(float(np.percentile(magnitude[::2, ::2], STRONG_EDGE_PERCENTILE)), STRONG_EDGE_FLOOR)
@@ -209,8 +209,8 @@ def _list_ranking(neighbours: IntArray, longest: int) -> tuple[IntArray, IntArra
 def _subpixel(
     columns: IntArray,
     rows: IntArray,
-    gradient_x: npt.NDArray[np.float32],
-    gradient_y: npt.NDArray[np.float32],
+    gradient_x: FloatArray,
+    gradient_y: FloatArray,
     magnitude: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Parabola through the gradient magnitude one pixel to either side, across the edge."""
