@@ -11,7 +11,7 @@ from unbend_service.application.grey import grey_of_frame
 from unbend_service.application.ports import Bytes, DecodedImage, GridStore, ImageCodec, Meter, RenderPool
 from unbend_service.domain.errors import InvalidOption, UnbendError
 from unbend_service.domain.fit import CROP, Fit
-from unbend_service.domain.frames import BLACK, Border, Frame
+from unbend_service.domain.frames import BLACK, Border, Frame, with_alpha
 from unbend_service.domain.grid import Grid
 from unbend_service.domain.records import Correct, GridRecord, Outcome
 
@@ -99,7 +99,11 @@ class Correction:
         image = await self._blocking.run("decode", self._codec.decode, body)
         source_format = image.image_format
         image_format = options.image_format or (source_format if source_format in WRITTEN_FORMATS else "png")
-        record = await self._record(image.frame, options)
+        if options.border.alpha < 255 and options.fit != CROP:
+            if image_format == "jpeg":
+                raise InvalidOption("jpeg has no transparency.", allowed="a border colour, or format=png or webp")
+            image = replace(image, frame=with_alpha(image.frame))
+        record = await self._record_of_image(body, options)
         if image.upright and image_format == source_format and leaves_alone(record):
             self._meter.frame("left_alone")
             return CorrectedImage(body, image_format, record)
@@ -148,6 +152,11 @@ class Correction:
     def render_workers(self) -> int:
         """Workers that render, whatever they do now."""
         return len(self._pool.state().workers)
+
+    async def _record_of_image(self, body: bytes, options: CorrectOptions) -> GridRecord:
+        if options.grid_id is not None:
+            return await self._store.get(options.grid_id)
+        return await self._estimation.of_image(body, options.correct, min_confidence=options.min_confidence)
 
     async def _record(self, frame: Frame, options: CorrectOptions) -> GridRecord:
         if options.grid_id is not None:

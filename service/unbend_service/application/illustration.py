@@ -7,8 +7,7 @@ from enum import StrEnum
 
 from unbend_service.application.blocking import BlockingWork
 from unbend_service.application.correction import WRITTEN_FORMATS
-from unbend_service.application.estimation import ESTIMATE_LONGEST_PX, Estimation
-from unbend_service.application.grey import grey_of_frame
+from unbend_service.application.estimation import Estimation
 from unbend_service.application.ports import GridStore, Illustrator, ImageCodec
 from unbend_service.domain.errors import InvalidOption
 from unbend_service.domain.frames import Frame
@@ -73,8 +72,7 @@ class Illustration:
         if grid_id is not None:
             record = await self._store.get(grid_id)
         else:
-            grey = await self._blocking.run("decode", grey_of_frame, image.frame, ESTIMATE_LONGEST_PX)
-            record = await self._estimation.record(await self._estimation.of_grey(grey), correct)
+            record = await self._estimation.of_image(body, correct)
         drawn = await self._blocking.run("render", self._draw, image.frame, subject, record)
         chosen = image_format or (image.image_format if image.image_format in WRITTEN_FORMATS else "png")
         encoded = await self._blocking.run(

@@ -129,6 +129,24 @@ def split_planes(data: Bytes, pixel_format: PixelFormat, width: int, height: int
     return tuple(views)
 
 
+def with_alpha(frame: Frame) -> Frame:
+    """A packed frame with an opaque alpha channel: gray8 and rgb24 become rgba, bgr24 becomes bgra.
+
+    Raises:
+        InvalidFrame: a planar frame.
+    """
+    if frame.pixel_format.has_alpha:
+        return frame
+    (pixels, *others) = frame.plane_arrays()
+    if others:
+        raise InvalidFrame(f"{frame.pixel_format} frames have no room for alpha.")
+    opaque = np.empty((frame.height, frame.width, 4), np.uint8)
+    opaque[..., :3] = pixels if pixels.ndim == 3 else pixels[..., None]
+    opaque[..., 3] = 255
+    chosen = PixelFormat.BGRA if frame.pixel_format is PixelFormat.BGR24 else PixelFormat.RGBA
+    return Frame(chosen, frame.width, frame.height, opaque.reshape(-1))
+
+
 @dataclass(frozen=True, slots=True)
 class Border:
     """What is painted where the map points outside the source.
