@@ -88,3 +88,10 @@ def test_meters_are_independent() -> None:
 def test_every_name_is_prefixed() -> None:
     """Whoever scrapes finds all of it under unbend_."""
     assert all(name.startswith("unbend_") for name, _ in samples(PrometheusMeter()))
+
+
+def test_nothing_is_said_twice() -> None:
+    """Creation times, which double a scrape, are left out."""
+    meter = PrometheusMeter()
+    meter.frame("corrected")
+    assert not [name for name, _ in samples(meter) if name.endswith("_created")]

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter as Tally
+from collections.abc import Iterable
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
+from prometheus_client.metrics_core import Metric
 
 from unbend_service.application.ports import ModelInfo, PoolState
 
@@ -114,4 +116,20 @@ class PrometheusMeter:
 
     def render(self) -> tuple[bytes, str]:
         """Everything counted so far, in the Prometheus text format, and its content type."""
-        return generate_latest(self._registry), CONTENT_TYPE_LATEST
+        return generate_latest(_WithoutBirthdays(self._registry)), CONTENT_TYPE_LATEST
+
+
+class _WithoutBirthdays(CollectorRegistry):
+    """A view of a registry without the ``_created`` samples, which would double every scrape for nobody's use.
+
+    The library can leave them out too, but only for all of the process.
+    """
+
+    def __init__(self, registry: CollectorRegistry) -> None:
+        super().__init__()
+        self._behind = registry
+
+    def collect(self) -> Iterable[Metric]:
+        for family in self._behind.collect():
+            family.samples = [sample for sample in family.samples if not sample.name.endswith("_created")]
+            yield family
