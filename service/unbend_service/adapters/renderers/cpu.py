@@ -74,7 +74,7 @@ class CpuRenderer:
 
     @property
     def info(self) -> RendererInfo:
-        return RendererInfo("cpu", f"OpenCV {cv2.__version__} remap, {cv2.getNumThreads()} threads", hardware=False)
+        return RendererInfo("cpu", f"OpenCV {cv2.__version__} remap", hardware=False)
 
     @property
     def kept_bytes(self) -> int:

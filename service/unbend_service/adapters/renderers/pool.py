@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import structlog
 
 from unbend_service.adapters.renderers.channel import Done, Failed
+from unbend_service.adapters.renderers.copies import Copies
 from unbend_service.adapters.renderers.cores import usable_cores
 from unbend_service.adapters.renderers.jobs import Job, JobQueue, preferred_worker
 from unbend_service.adapters.renderers.selection import RendererOptions
@@ -35,8 +34,6 @@ log = structlog.get_logger(__name__)
 DEFAULT_FACTORY = "unbend_service.adapters.renderers.selection:open_renderer"
 #: A GPU gains little from more processes than keep it fed, and each holds a context and textures of its own.
 _WORKERS_OF_A_GPU = 4
-#: Larger copies are made off the event loop.
-_INLINE_COPY_BYTES = 256 << 10
 _METER_INTERVAL_S = 0.1
 
 
@@ -65,14 +62,12 @@ class WorkerPool:
         self._closed = False
         self._done_all = asyncio.Event()
         self._meter_timer: asyncio.TimerHandle | None = None
-        self._copies = ThreadPoolExecutor(max_workers=2, thread_name_prefix="unbend-copy")
-        cores = usable_cores()
-        self._cores = cores
-        count = settings.workers or cores
+        self._copies = Copies()
+        self._cores = usable_cores()
         options = RendererOptions(
             renderer=settings.renderer,
             require_gpu=settings.require_gpu,
-            threads=max(1, cores // count),
+            threads=max(1, self._cores // (settings.workers or self._cores)),
             egl_device=settings.egl_device,
             map_cache_bytes=settings.map_cache_bytes,
         )
@@ -116,7 +111,7 @@ class WorkerPool:
         )
         self._jobs.add(job)
         self._queue.append(job)
-        self.dispatch()
+        self._dispatch()
         try:
             async with asyncio.timeout_at(job.accepted_s + limit_s):
                 return await job.answer
@@ -127,7 +122,7 @@ class WorkerPool:
         finally:
             if self._queue.remove(job):
                 self._finish(job)
-                self.dispatch()
+                self._dispatch()
             elif job.answer.done() and not job.answer.cancelled():
                 job.answer.exception()  # seen, even where the caller went in the very moment of the answer
 
@@ -168,7 +163,7 @@ class WorkerPool:
             log.warning("frames given up at shutdown", frames=len(self._jobs))
         finally:
             await self._supervisor.close()
-            await asyncio.to_thread(self._copies.shutdown)
+            await self._copies.close()
             self._queue = JobQueue()
             for job in self._jobs:
                 job.slot = None
@@ -179,9 +174,7 @@ class WorkerPool:
                 self._meter_timer.cancel()
             self._meter.pool(self.state())
 
-    # What the supervisor tells.
-
-    def dispatch(self) -> None:
+    def _dispatch(self) -> None:
         """Gives waiting frames to workers that can take them: first to idle ones, there to the preferred one."""
         while self._queue:
             able = [w for w in self._supervisor.ready() if len(w.held) < self._settings.slots_per_worker]
@@ -204,7 +197,7 @@ class WorkerPool:
             self._queue.remove(job)
             chosen = next((w for w in able if w.index == preferred), None) or min(able, key=lambda w: len(w.held))
             self._assign(job, chosen)
-        self.note_state()
+        self._note_state()
 
     def on_answer(self, worker: WorkerProcess, answer: Done | Failed) -> None:
         """A worker answered the first of the jobs it knows of."""
@@ -248,9 +241,9 @@ class WorkerPool:
         self._meter.worker_restarted(reason)
 
     def on_change(self) -> None:
-        self.dispatch()
+        self._dispatch()
 
-    def note_state(self) -> None:
+    def _note_state(self) -> None:
         """Tells the meter what the pool looks like, soon, and not for every frame."""
         if self._meter_timer is None:
             loop = asyncio.get_running_loop()
@@ -259,8 +252,6 @@ class WorkerPool:
     def _tell_state(self) -> None:
         self._meter_timer = None
         self._meter.pool(self.state())
-
-    # The way of one frame.
 
     def _assign(self, job: Job, worker: WorkerProcess) -> None:
         worker.held.add(job)
@@ -282,9 +273,9 @@ class WorkerPool:
                 self._finish(job)
             else:
                 self._queue.put_first(job)
-            self.dispatch()
+            self._dispatch()
 
-        self._copy(source, job.frame.data, copied)
+        self._copies.copy(source, job.frame.data, copied)
 
     def _copy_out(self, job: Job) -> None:
         if job.answer.done() or job.slot is None:
@@ -296,18 +287,9 @@ class WorkerPool:
             if not job.answer.done():
                 job.answer.set_result(result)
             self._finish(job)
-            self.dispatch()
+            self._dispatch()
 
-        self._copy(result, job.slot.memory[job.size_bytes : 2 * job.size_bytes], copied)
-
-    def _copy(self, target: Bytes, source: Bytes, then: Callable[[], None]) -> None:
-        if source.size <= _INLINE_COPY_BYTES:
-            np.copyto(target, source)
-            then()
-            return
-        loop = asyncio.get_running_loop()
-        copying = loop.run_in_executor(self._copies, np.copyto, target, source)
-        copying.add_done_callback(lambda _: then())
+        self._copies.copy(result, job.slot.memory[job.size_bytes : 2 * job.size_bytes], copied)
 
     def _finish(self, job: Job) -> None:
         """The pool is done with the job; its slot is free for the next."""

@@ -15,6 +15,9 @@ from unbend_service.adapters.renderers.jobs import Job
 from unbend_service.adapters.renderers.selection import RendererOptions
 from unbend_service.application.ports import RendererInfo
 
+#: Mesa's software renderer, and the libraries below numpy, would start a thread for every core of the machine.
+_THREAD_LIMITS = ("LP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+_STDERR_FD = 2
 _GRIDS_KEPT_BYTES = 32 << 20
 
 
@@ -45,8 +48,10 @@ class WorkerProcess:
                 # -P: a file of the working directory must not stand in for a module of the service
                 [sys.executable, "-P", "-m", "unbend_service.adapters.renderers.worker", str(theirs.fileno())],
                 stdin=subprocess.DEVNULL,
+                stdout=_STDERR_FD,  # our own standard output may be somebody's video
+                process_group=0,  # an interrupt from the keyboard is for the parent to decide on
                 pass_fds=(theirs.fileno(),),
-                env={"LP_NUM_THREADS": str(options.threads), **os.environ},
+                env={**dict.fromkeys(_THREAD_LIMITS, str(options.threads)), **os.environ},
             )
         except OSError:
             self.channel.close()
