@@ -37,6 +37,7 @@ STATUS_CODES: dict[type[errors.UnbendError], grpc.StatusCode] = {
     errors.TooManyStreams: grpc.StatusCode.RESOURCE_EXHAUSTED,
     errors.Unavailable: grpc.StatusCode.UNAVAILABLE,
     errors.Draining: grpc.StatusCode.UNAVAILABLE,
+    errors.GridStoreUnavailable: grpc.StatusCode.UNAVAILABLE,
     errors.ModelUnavailable: grpc.StatusCode.UNAVAILABLE,
     errors.RendererUnavailable: grpc.StatusCode.UNAVAILABLE,
     errors.RenderFailed: grpc.StatusCode.INTERNAL,
