@@ -332,13 +332,12 @@ async def test_a_stream_that_cannot_be_ends_with_a_typed_error_and_the_server_st
     await still_serves(rpc)
 
 
-async def endless() -> AsyncIterator[Request]:
+async def unfinished() -> AsyncIterator[Request]:
+    """A few frames, and then silence: grpc.aio forgets the status of a call that ends during a write (grpc#36066)."""
     yield opening(stream_id="camera-7")
-    index = 0
-    while True:
+    for index in range(6):
         yield frame(index)
-        index += 1
-        await asyncio.sleep(0.01)
+    await asyncio.sleep(60)
 
 
 async def read_to_the_end(call: grpc.aio.StreamStreamCall[Request, Response]) -> None:
@@ -355,7 +354,7 @@ async def eventually(condition) -> None:
 
 
 async def test_a_client_that_cancels_leaves_nothing_behind(rpc: Rpc) -> None:
-    call = rpc.correction.CorrectStream(endless())
+    call = rpc.correction.CorrectStream(unfinished())
     await call.read()
     assert rpc.service.streams.active == 1
 
@@ -367,7 +366,7 @@ async def test_a_client_that_cancels_leaves_nothing_behind(rpc: Rpc) -> None:
 
 
 async def test_a_second_connection_takes_a_stream_over_and_the_first_is_told(rpc: Rpc) -> None:
-    older = rpc.correction.CorrectStream(endless())
+    older = rpc.correction.CorrectStream(unfinished())
     await older.read()
 
     newer = await converse(rpc, opening(stream_id="camera-7"), frame(0))
@@ -396,7 +395,7 @@ async def test_a_stuck_reader_can_be_taken_over(rpc: Rpc) -> None:
 
 
 async def test_draining_ends_streams_after_what_was_accepted_and_refuses_new_calls(rpc: Rpc) -> None:
-    call = rpc.correction.CorrectStream(endless())
+    call = rpc.correction.CorrectStream(unfinished())
     for _ in range(4):
         await call.read()
 
