@@ -54,6 +54,8 @@ async def read_image(request: Request, limit_bytes: int) -> bytes:
     parser = MultiPartParser(request.headers, _bounded(request, limit_bytes), max_files=1, max_fields=8)
     try:
         form = await parser.parse()
+    except BodyTooLarge:
+        raise
     except MultiPartException as error:
         raise InvalidInput(f"The form cannot be read: {error.message}") from error
     except (KeyError, ValueError) as error:  # no boundary, or an unknown charset

@@ -97,7 +97,7 @@ def router(service: Service, settings: Settings) -> APIRouter:
         response_class=Response,
         responses={
             200: {"model": GridRecordBody, "description": "The grid and its provenance."},
-            **problems.responses(errors.GridNotFound, errors.Unavailable),
+            **problems.responses(errors.GridNotFound, errors.InvalidOption, errors.Unavailable),
         },
     )
     async def get(grid_id: parameters.GridIdPath) -> Response:
@@ -109,7 +109,7 @@ def router(service: Service, settings: Settings) -> APIRouter:
         summary="Forget a grid",
         status_code=204,
         response_class=Response,
-        responses=problems.responses(errors.GridNotFound, errors.Unavailable),
+        responses=problems.responses(errors.GridNotFound, errors.InvalidOption, errors.Unavailable),
     )
     async def delete(grid_id: parameters.GridIdPath) -> Response:
         """Streams that were given it estimate anew when they are resumed."""
