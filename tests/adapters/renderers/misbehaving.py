@@ -1,0 +1,74 @@
+"""Renderers for worker processes that do what the first byte of the frame tells them. Loaded by name, in the worker."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+from unbend_service.adapters.renderers.cpu import CpuRenderer
+from unbend_service.adapters.renderers.selection import RendererOptions
+from unbend_service.application.ports import Bytes, RendererInfo
+from unbend_service.domain.errors import RendererUnavailable
+from unbend_service.domain.frames import Border, Frame
+from unbend_service.domain.grid import Grid
+
+DRAW, SLEEP, DIE, DIE_ONCE, HANG, RAISE, WHO, HANG_ONCE = range(8)
+SLEEP_S = 0.3
+
+
+class MisbehavingRenderer:
+    """Answers WHO with the number of its process in the first four bytes."""
+
+    def __init__(self) -> None:
+        self._renderer = CpuRenderer()
+
+    @property
+    def info(self) -> RendererInfo:
+        return RendererInfo("cpu", "misbehaving", hardware=False)
+
+    def render(self, source: Frame, grid: Grid, border: Border, target: Bytes) -> None:
+        order = int(source.data[0])
+        self._renderer.render(source, grid, border, target)
+        if order == SLEEP:
+            time.sleep(SLEEP_S)
+        elif order == DIE or (order == DIE_ONCE and first_time()):
+            os.kill(os.getpid(), signal.SIGKILL)
+        elif order == HANG or (order == HANG_ONCE and first_time()):
+            time.sleep(3600)
+        elif order == RAISE:
+            raise ValueError("a renderer that fails")
+        elif order == WHO:
+            time.sleep(0.02)
+            target[:4] = list(os.getpid().to_bytes(4))
+
+    def close(self) -> None:
+        self._renderer.close()
+
+
+def first_time() -> bool:
+    """Whether no worker of this test came here before."""
+    try:
+        Path(os.environ["UNBEND_TEST_MARK"]).touch(exist_ok=False)
+    except FileExistsError:
+        return False
+    return True
+
+
+def open_misbehaving(options: RendererOptions) -> MisbehavingRenderer:
+    return MisbehavingRenderer()
+
+
+def open_nothing(options: RendererOptions) -> MisbehavingRenderer:
+    raise RendererUnavailable("There is nothing to render with.", setting="renderer")
+
+
+def die_at_start(options: RendererOptions) -> MisbehavingRenderer:
+    os._exit(3)
+
+
+def die_at_restart(options: RendererOptions) -> MisbehavingRenderer:
+    if not first_time():
+        os._exit(3)
+    return MisbehavingRenderer()
