@@ -252,7 +252,7 @@ def _split_at_corners(x: FloatArray, y: FloatArray, strength: FloatArray, chain:
     starts |= corner
     starts[1:] |= corner[:-1]
     piece = np.cumsum(starts) - 1
-    size = np.bincount(piece)
+    size = np.bincount(piece)  # a piece whose ends nearly meet cannot have been straight: it goes by its span
     first = np.flatnonzero(starts)
     last = first + size - 1
     span = np.hypot(x[last] - x[first], y[last] - y[first])
