@@ -18,7 +18,7 @@ Float64 = npt.NDArray[np.float64]
 _FARTHEST = 3.0
 #: Bound of the relative change of pace per step (an eighth of the frame).
 _LARGEST_BEND = 1.0
-#: An edge so far outside the picture begins to be led straight away from it, at twice that it is; half picture widths.
+#: A coordinate so far outside the picture, in half picture widths, does not come nearer to it any more.
 _BLENDED = 0.125
 
 
@@ -77,8 +77,8 @@ def _beyond(lattice: Float64, margin: int) -> Float64:
     takes its place, which has the same curvature at the edge, never turns and has no limit. Across, the parabola is
     left for its tangent after two steps.
 
-    An edge that lies outside the picture may be an extrapolation already. It is led straight away from the picture,
-    so that nothing comes into sight again out there; in between the two are blended.
+    A coordinate that lies outside the picture at the edge may be an extrapolation already. It may grow but not come
+    back, so that nothing comes into sight again out there; just outside, the bound sets in gradually.
     """
     distance = np.arange(1, margin + 1)[:, None, None]
     count = len(lattice)
@@ -96,6 +96,6 @@ def _beyond(lattice: Float64, margin: int) -> Float64:
     along = np.where(bend >= 0, k + bend * k**2 / 2, np.log1p(-slackening * k) / -slackening)
     across = np.where(k <= 2, k**2 / 2, 2 * k - 2)
     curved = edge + along * pace + across * sideways
-    outside = np.clip((np.abs(edge).max(axis=-1, keepdims=True) - 1) / _BLENDED - 1, 0, 1)
-    away = edge * (1 + k / 4)
-    return np.asarray(curved + outside * (away - curved))
+    far = np.abs(edge)
+    bound = np.where(far < 1 + _BLENDED, 0.5 + (far - 1) * (0.5 + _BLENDED) / _BLENDED, far)
+    return np.asarray(np.where(far > 1, np.sign(edge) * np.maximum(np.sign(edge) * curved, bound), curved))

@@ -191,15 +191,19 @@ def _connected(mask: npt.NDArray[np.bool_], seed: tuple[int, int]) -> npt.NDArra
     """The part of a (rows, columns) mask that hangs together, side by side, with the true sample ``seed``."""
     part = np.zeros_like(mask)
     part[seed] = True
-    count = 1
-    while True:
-        for axis in (0, 1):
-            # Along each run of the mask a member makes all of the run a member: runs are numbered by their gaps.
-            runs = np.cumsum(~mask, axis=axis) + np.expand_dims(np.arange(mask.shape[1 - axis]), axis) * (mask.size + 1)
-            part = mask & np.isin(runs, runs[part])
-        if part.sum() == count:
-            return part
-        count = int(part.sum())
+    # Along each run of the mask one member makes all of the run members; runs are numbered by line and gap.
+    numbered = []
+    for axis in (0, 1):
+        lines = np.expand_dims(np.arange(mask.shape[1 - axis]), axis) * (mask.shape[axis] + 1)
+        numbered.append(np.cumsum(~mask, axis=axis) + lines)
+    count = 0
+    while (size := int(part.sum())) != count:
+        count = size
+        for runs in numbered:
+            member = np.zeros(int(runs.max()) + 1, dtype=bool)
+            member[runs[part]] = True
+            part = mask & member[runs]
+    return part
 
 
 def _highest(normals: Float64, slack: Float64) -> Float64:
