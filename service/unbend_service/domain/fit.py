@@ -103,11 +103,11 @@ def _shown(grid: Grid, window: Window, lattice: Float64) -> Float32:
 
 
 def _without_gaps(grid: Grid, window: Window, lattice: Float64) -> Grid:
-    """The rendered lattice is piecewise linear, so it shows no invalid pixel once all of its points are valid."""
+    """Shrinks the window until all points of its lattice are valid: between them the rendered lattice is linear."""
     half = window.half
     for _ in range(200):
         source = _shown(grid, Window(window.x, window.y, half), lattice)
-        if within(source).all() and half > _SMALLEST_WINDOW:
+        if half > _SMALLEST_WINDOW and within(source).all() and folded_share(source) == 0:
             return Grid(source)
         half *= 0.99
     raise InvalidGrid("No part of the target shows the source without a gap.")

@@ -75,7 +75,8 @@ class WindowSearch:
         """The largest window without an invalid point: of the samples first, then grown to the map itself.
 
         Only the rim of a window is looked at while it grows: where the map does not fold, the source of a window lies
-        inside the closed curve that is the source of its rim, and the picture is convex.
+        inside the closed curve that is the source of its rim, and the picture is convex. Whether it folds is asked
+        at the end.
         """
         sums = np.pad(np.cumsum(np.cumsum(self._shown, axis=0), axis=1), ((1, 0), (1, 0)))
 
@@ -90,7 +91,10 @@ class WindowSearch:
         half = (low - 1) * _SPACING / 2
         centres = self._points[np.nonzero(places(low))] + half
         best = centres[np.argmin(np.hypot(*centres.T))]
-        return self._grown(Window(float(best[0]), float(best[1]), half))
+        window = Window(float(best[0]), float(best[1]), half)
+        grown = self._grown(window)
+        candidates = (window.towards(grown, share) for share in (1.0, 0.75, 0.5, 0.25))
+        return next((one for one in candidates if self._is_unfolded(one)), window)
 
     def full(self) -> Window:
         """The smallest window that holds every shown sample and the target of every point of the source's border.
@@ -125,8 +129,8 @@ class WindowSearch:
             slope = np.stack([by_x, by_y, by_half], axis=-1).reshape(-1, 3)
             normals = np.concatenate([slope, -slope, np.eye(3), -np.eye(3)])
             slack = np.concatenate([1 - source.ravel(), 1 + source.ravel(), np.full(6, trust)])
-            x, y, half = _highest(normals, np.maximum(slack, 1e-9))
-            moved = Window(window.x + x, window.y + y, window.half + half)
+            x, y, half = _highest(normals, np.maximum(slack, 1e-7))
+            moved = Window(window.x + float(x), window.y + float(y), window.half + float(half))
             better = self._largest(moved, rim, window.half, window.half + 1.5 * max(half, 1e-6))
             gain = better.half - window.half
             if gain > 0 and self._valid(better, rim):
@@ -146,6 +150,10 @@ class WindowSearch:
             first = int(bad[0]) if len(bad) else len(halves)
             low, high = (halves[first - 1] if first else low), halves[min(first, len(halves) - 1)]
         return Window(window.x, window.y, float(low))
+
+    def _is_unfolded(self, window: Window) -> bool:
+        source = self._backward(window.points(target_lattice(*self._shape)))
+        return bool((cell_orientations(source) * self._sign > 0).all())
 
     def _valid(self, window: Window, rim: Float64) -> bool:
         return bool(within(self._backward(window.points(rim))).all())
@@ -221,7 +229,9 @@ def _highest(normals: Float64, slack: Float64) -> Float64:
         gradient = normals.T @ inverse
         gradient[2] -= weight
         scaled = normals * inverse[:, None]
-        step = -np.linalg.solve(scaled.T @ scaled, gradient)
+        curvature = scaled.T @ scaled
+        curvature += 1e-12 * np.trace(curvature) * np.eye(3)  # a corner of the polytope makes it nearly singular
+        step = -np.linalg.solve(curvature, gradient)
         change = normals @ step
         towards = change > 0
         length = min(1.0, 0.9 * float((left[towards] / change[towards]).min(initial=np.inf)))
