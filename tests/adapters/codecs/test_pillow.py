@@ -294,6 +294,15 @@ def bombs() -> dict[str, bytes]:
     return {"png": png_header(30_000, 30_000), "webp": webp, "jpeg": bytes(jpeg), "bmp": bytes(bmp), "tiff": tiff}
 
 
+@pytest.mark.parametrize("image_format", ["png", "webp", "jpeg", "bmp"])
+def test_a_bare_header_is_enough(image_format: str) -> None:
+    """A file that is nothing but the header of a bomb is called by its name too."""
+    body = bombs()[image_format]
+    length = {"png": 33, "webp": 30, "jpeg": body.index(b"\xff\xc0") + 30 if image_format == "jpeg" else 0, "bmp": 54}
+    with pytest.raises(TooManyPixels):
+        CODEC.probe(body[: length[image_format]])
+
+
 @pytest.mark.parametrize("image_format", ["png", "webp", "jpeg", "bmp", "tiff"])
 def test_a_bomb_is_refused_by_its_header(image_format: str) -> None:
     """A header that announces too many pixels is refused, with the setting's name, before anything is allocated."""

@@ -23,7 +23,7 @@ from PIL.TiffImagePlugin import TiffImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
 from unbend_service.adapters.codecs import exif
-from unbend_service.adapters.codecs.signatures import sniff, webp_size
+from unbend_service.adapters.codecs.signatures import announced_size, sniff
 from unbend_service.application.ports import Bytes, DecodedImage, ImageHeader
 from unbend_service.domain.errors import InvalidFrame, InvalidImage, InvalidOption, TooManyPixels, UnbendError
 from unbend_service.domain.frames import Frame, PixelFormat
@@ -155,8 +155,9 @@ class PillowCodec:
 
     def _open(self, body: bytes, image_format: str) -> ImageFile.ImageFile:
         """Reads the header and holds it against the limits, before any pixel is allocated."""
-        if image_format == "webp":
-            self._check_size(*webp_size(body))
+        announced = announced_size(body, image_format)
+        if announced is not None:
+            self._check_size(*announced)
         with _translated(image_format), _without_warnings():
             image = _OPENERS[image_format](io.BytesIO(body))
             self._check_size(*image.size)

@@ -29,7 +29,19 @@ def sniff(body: bytes) -> str:
     raise UnsupportedMediaType("The body is not an image of a known format.", allowed=", ".join(READ_FORMATS))
 
 
-def webp_size(body: bytes) -> tuple[int, int]:
+def announced_size(body: bytes, image_format: str) -> tuple[int, int] | None:
+    """(width, height) in pixels as the first bytes say, so that a bomb is called one even if nothing follows.
+
+    None where Pillow says it as early. Raises InvalidImage.
+    """
+    if image_format == "webp":
+        return _webp_size(body)
+    if image_format == "png" and len(body) >= 24:
+        return int.from_bytes(body[16:20], "big"), int.from_bytes(body[20:24], "big")
+    return None
+
+
+def _webp_size(body: bytes) -> tuple[int, int]:
     """(width, height) in pixels of a WebP canvas, without its decoder, which allocates the canvas when it is made.
 
     RFC 9649, sections 2.5 to 2.7. Raises InvalidImage.
