@@ -71,10 +71,11 @@ class OverlayIllustrator:
         source = grid.source.astype(np.float64)
         target = target_lattice(grid.rows, grid.columns)
         moves_px = (target - source) * np.array([width, height]) / 2
-        longest_px = float(np.hypot(moves_px[..., 0], moves_px[..., 1]).max())
-        mean_px = float(np.hypot(moves_px[..., 0], moves_px[..., 1]).mean())
+        lengths_px = np.hypot(moves_px[..., 0], moves_px[..., 1])
+        longest_px, mean_px = float(lengths_px.max()), float(lengths_px.mean())
         spacing_px = max(width, height) / _LONG_SIDE_ARROWS
-        factor = _exaggeration(longest_px, spacing_px)
+        # a single corner that flies away must not make all other arrows dots
+        factor = _exaggeration(float(np.percentile(lengths_px[r, c], 90)), spacing_px)
         starts = _pixels(source[r, c], canvas).reshape(-1, 2)
         moves = moves_px[r, c].reshape(-1, 2)
         _draw_arrows(canvas, starts, moves, factor, longest_px)
@@ -142,11 +143,11 @@ def _draw_halo(canvas: Bytes, curves: list[npt.NDArray[np.int32]], width: int) -
     cv2.addWeighted(dark, _HALO_OPACITY, canvas, 1 - _HALO_OPACITY, 0, dst=canvas)
 
 
-def _exaggeration(longest_px: float, spacing_px: float) -> int:
-    """The largest factor with which the longest arrow is about one cell long."""
-    if longest_px < _STILL_PX:
+def _exaggeration(long_px: float, spacing_px: float) -> int:
+    """The largest factor with which an arrow of ``long_px`` is drawn about one cell long."""
+    if long_px < _STILL_PX:
         return 1
-    fitting = [factor for factor in _EXAGGERATIONS if factor * longest_px <= 1.1 * spacing_px]
+    fitting = [factor for factor in _EXAGGERATIONS if factor * long_px <= 1.1 * spacing_px]
     return max(fitting, default=1)
 
 
