@@ -39,21 +39,16 @@ class Worker:
         self._failures = 0
 
     def serve(self) -> None:
-        """Works until the channel ends or the renderer fails again and again."""
+        """Works until the renderer fails again and again; raises EOFError or ConnectionError when the parent goes."""
         while self._failures < _FAILURES_IN_A_ROW:
-            try:
-                message, fd = self._channel.receive()
-                if isinstance(message, MapSlot) and fd is not None:
-                    self._slots[message.slot] = Slot(message.slot, fd, message.size_bytes)
-                elif isinstance(message, UnmapSlots):
-                    for number in message.slots:
-                        self._slots.pop(number).close()
-                elif isinstance(message, Task):
-                    self._channel.send(self._answer(message))
-            except (EOFError, ConnectionError):
-                break
-        for slot in self._slots.values():
-            slot.close()
+            message, fd = self._channel.receive()
+            if isinstance(message, MapSlot) and fd is not None:
+                self._slots[message.slot] = Slot(message.slot, fd, message.size_bytes)
+            elif isinstance(message, UnmapSlots):
+                for number in message.slots:
+                    self._slots.pop(number).close()
+            elif isinstance(message, Task):
+                self._channel.send(self._answer(message))
 
     def _answer(self, task: Task) -> Done | Failed:
         started = time.perf_counter()
@@ -105,14 +100,19 @@ def _settle(name: str) -> None:
 
 
 def main(arguments: list[str]) -> int:
+    """Serves the channel whose descriptor is the first argument; the exit status says whether it ended as it should."""
     channel = Channel.from_fd(int(arguments[0]))
     try:
         begin, _ = channel.receive()
-    except EOFError:
-        return 0
-    if not isinstance(begin, Begin):
-        return 2
-    _settle(begin.name)
+        if not isinstance(begin, Begin):
+            return 2
+        _settle(begin.name)
+        return _serve(channel, begin)
+    except (EOFError, ConnectionError):
+        return 0  # the parent has gone
+
+
+def _serve(channel: Channel, begin: Begin) -> int:
     try:
         renderer = _open(begin)
     except Exception as error:
