@@ -4,14 +4,15 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from tests.domain.lenses import BARREL, PINCUSHION, WAVE, projective, radial, rotation, shear, wave
-from unbend_service.domain.errors import InvalidGrid, InvalidOption
+from unbend_service.domain.errors import FoldedGrid, InvalidGrid, InvalidGuides, InvalidOption
 from unbend_service.domain.fit import CROP, FULL, KEEP, Fit, with_fit, with_strength
 from unbend_service.domain.fitting import guides_from_map
 from unbend_service.domain.grid import Grid, folded_share
+from unbend_service.domain.guides import DEFAULT_ANCHORS, GuideFamily, Guides
 from unbend_service.domain.homography import without_plane_part
 from unbend_service.domain.maps import BackwardMap, Float64, target_lattice
 
@@ -57,6 +58,29 @@ def test_crop_shows_no_gap(true: BackwardMap) -> None:
     assert np.abs(cropped.source).max() <= 1
     assert np.abs(cropped(uniform())).max() <= 1 + 1e-12
     assert folded_share(cropped.source) == 0
+
+
+@settings(max_examples=10)
+@example(96)  # these two grow into a fold of the continuation when only the rim of the window is looked at
+@example(159)
+@given(st.integers(0, 2**32 - 1))
+def test_the_crop_of_wild_guides_is_whole(seed: int) -> None:
+    """Guides that no lens would have: what passes the fold check is cropped without a gap and without a fold."""
+    rng = np.random.default_rng(seed)
+    straight = GuideFamily.straight(DEFAULT_ANCHORS, 3).coefficients
+    rows, columns = (
+        GuideFamily(DEFAULT_ANCHORS, straight + rng.normal(0, 0.05, straight.shape) * [1, 0.7, 0.5, 0.3])
+        for _ in range(2)
+    )
+    try:
+        grid = Grid.from_map(Guides(rows, columns))
+        grid.check_unfolded()
+    except (InvalidGuides, FoldedGrid):
+        return
+    for fit in (CROP, FULL):
+        fitted = with_fit(grid, fit)
+        assert folded_share(fitted.source) == 0
+        assert fit is FULL or np.abs(fitted(uniform(101))).max() <= 1 + 1e-12
 
 
 @settings(max_examples=20)
