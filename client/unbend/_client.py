@@ -1,0 +1,251 @@
+"""``Client``: the service from a thread."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from types import TracebackType
+from typing import TypeVar
+
+import grpc
+
+from unbend import _calls as calls
+from unbend import _types as types
+from unbend._channel import open_channel
+from unbend._errors import Closed
+from unbend._failures import translate
+from unbend._images import FrameLayout
+from unbend._retries import Attempts
+from unbend._stream import Stream
+from unbend._stream_core import StreamOptions
+
+T = TypeVar("T")
+
+DEFAULT_TARGET = "127.0.0.1:50051"
+
+
+class Client:
+    """A connection to an Unbend service; may be shared by threads.
+
+    >>> import numpy as np, unbend
+    >>> with unbend.Client("127.0.0.1:50051") as client:  # doctest: +SKIP
+    ...     correction = client.correct(np.zeros((480, 640, 3), np.uint8))
+    ...     print(correction.outcome, correction.image.shape)
+
+    Args:
+        target: host:port of the service.
+        timeout_s: seconds that a call may take, its retries included, and that one answer of a stream may take.
+        retries: attempts after the first, of calls that may be repeated, when the server is gone or at a limit.
+        credentials: of ``grpc.ssl_channel_credentials`` for TLS; None connects in the clear.
+        metadata: pairs that are sent with every call, ``("authorization", "Bearer ...")`` for one.
+    """
+
+    def __init__(
+        self,
+        target: str = DEFAULT_TARGET,
+        *,
+        timeout_s: float = 30.0,
+        retries: int = 2,
+        credentials: grpc.ChannelCredentials | None = None,
+        metadata: Sequence[tuple[str, str]] = (),
+    ) -> None:
+        self._channel = open_channel(target, credentials)
+        self._timeout_s = timeout_s
+        self._retries = retries
+        self._metadata = tuple(metadata)
+        self._closed = False
+        self.grids = Grids(self)
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends the connection and the calls under way."""
+        self._closed = True
+        self._channel.close()
+
+    def correct(
+        self,
+        image: types.Image,
+        *,
+        pixel_format: str | None = None,
+        correct: str = "nonlinear",
+        fit: str | float = "crop",
+        strength: float = 1.0,
+        border: types.Border | None = None,
+        quality: int | None = None,
+        answer_format: str | None = None,
+        grid: calls.GridLike | None = None,
+        min_confidence: float | None = None,
+    ) -> types.Correction:
+        """Straightens one picture.
+
+        Args:
+            image: (height, width), (height, width, 3) RGB or (height, width, 4) RGBA uint8, or the bytes of a jpeg,
+                png or webp file.
+            pixel_format: how an array is to be read if not as above: ``bgr24``, ``bgra``, or ``i420`` and ``nv12`` of
+                shape (height * 3 / 2, width).
+            correct: ``nonlinear``: framing, tilt and perspective stay; ``all``: they are undone too. Ignored with
+                ``grid``.
+            fit: ``crop`` (no invalid pixel), ``full`` (every source pixel), ``keep``, or 0..1 between crop and full.
+            strength: 0..1, blend with the identity.
+            border: painted where the source has nothing; opaque black if left out.
+            quality: 1..100 of a jpeg or webp answer; the server's default if left out.
+            answer_format: ``jpeg``, ``png`` or ``webp`` if a file is to come back as another kind of file.
+            grid: used instead of an estimate: an id, a record, an estimate or an earlier correction, a lattice or
+                guides.
+            min_confidence: 0..1; below it the picture is left alone. The server's setting if left out.
+
+        Returns:
+            The corrected picture, an array of the same shape or a file, and the grid behind it.
+
+        Raises:
+            InvalidInput: the picture or an option; the subclass says which.
+            GridNotFound, Overloaded, Unavailable, RenderFailed, DeadlineExceeded.
+        """
+        return self._run(
+            calls.correct_call(
+                image,
+                self._grid_id(grid),
+                pixel_format=pixel_format,
+                correct=correct,
+                fit=fit,
+                strength=strength,
+                border=border,
+                quality=quality,
+                answer_format=answer_format,
+                min_confidence=min_confidence,
+            )
+        )
+
+    def estimate(
+        self,
+        image: types.Image,
+        *,
+        pixel_format: str | None = None,
+        correct: str = "nonlinear",
+        fit: str | float = "keep",
+        strength: float = 1.0,
+        min_confidence: float | None = None,
+    ) -> types.Estimate:
+        """Says how a picture is bent, without drawing it; arguments and errors as of :meth:`correct`."""
+        return self._run(
+            calls.estimate_call(
+                image,
+                pixel_format=pixel_format,
+                correct=correct,
+                fit=fit,
+                strength=strength,
+                min_confidence=min_confidence,
+            )
+        )
+
+    def stream(
+        self,
+        width: int | None = None,
+        height: int | None = None,
+        pixel_format: str = "rgb24",
+        *,
+        stream_id: str | None = None,
+        correct: str = "nonlinear",
+        fit: str | float = "crop",
+        strength: float = 1.0,
+        border: types.Border | None = None,
+        quality: int | None = None,
+        grid: str | types.GridRecord | types.Estimate | types.Guides | None = None,
+        frames: int | None = None,
+        while_estimating: str = "hold",
+        delivery: str = "lossless",
+        min_confidence: float | None = None,
+        estimate_again: bool = False,
+        in_flight: int = 8,
+        reconnects: int = 8,
+    ) -> Stream:
+        """A stream of frames, to be used in a ``with`` block.
+
+        >>> frames = (np.zeros((720, 1280, 3), np.uint8) for _ in range(100))
+        >>> with client.stream(1280, 720, "rgb24") as stream:  # doctest: +SKIP
+        ...     for result in stream.correct(frames):
+        ...         print(result.index, result.status, result.image.shape)
+
+        Args:
+            width, height: pixels of every frame; not needed for files.
+            pixel_format: gray8, rgb24, bgr24, rgba, bgra, i420, nv12, or files: jpeg, png, webp.
+            stream_id: opens an earlier stream again, with its grid; the server chooses one if left out.
+            correct, fit, strength, border, quality, min_confidence: as of :meth:`correct`.
+            grid: used instead of an estimate.
+            frames: 1..64, the number of first frames that the grid is estimated over.
+            while_estimating: ``hold``: frames wait for the grid; ``pass_through``: they come back as they are.
+            delivery: ``lossless``, or ``latest``: a newer frame replaces a waiting one, which is answered as dropped.
+            estimate_again: estimate anew although the stream id has a grid.
+            in_flight: frames that are sent ahead of their answers, at most as many as the server allows.
+            reconnects: attempts to mend a broken connection before one of them brings an answer.
+
+        Raises:
+            InvalidInput: what cannot be sent. Entering the block and iterating raise what the server says.
+        """
+        self._check_open()
+        options = StreamOptions(
+            stream_id=stream_id,
+            correct=correct,
+            fit=fit,
+            strength=strength,
+            border=border,
+            quality=quality,
+            grid=grid,
+            frames=frames,
+            while_estimating=while_estimating,
+            delivery=delivery,
+            min_confidence=min_confidence,
+            estimate_again=estimate_again,
+            in_flight=in_flight,
+            reconnects=reconnects,
+        )
+        layout = FrameLayout.of(pixel_format, width, height)
+        return Stream(self._channel, self._metadata, layout, options, self._timeout_s)
+
+    def _grid_id(self, grid: calls.GridLike | None) -> str | None:
+        if isinstance(grid, types.Grid | types.Guides):
+            return self.grids.put(grid).grid_id
+        return calls.grid_id_of(grid)
+
+    def _run(self, call: calls.Call[T]) -> T:
+        self._check_open()
+        method = self._channel.unary_unary(call.method, calls.serialize, call.answer.FromString)
+        attempts = Attempts(self._timeout_s, self._retries, call.repeatable)
+        while True:
+            try:
+                answer = method(call.request, timeout=attempts.left_s, metadata=self._metadata)
+            except grpc.RpcError as error:
+                pause_s = attempts.pause_s(translate(error))
+            else:
+                return call.parse(answer)
+            time.sleep(pause_s)
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise Closed("The client was closed.")
+
+
+class Grids:
+    """The grids that the server keeps; ``client.grids``."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+
+    def get(self, grid_id: str) -> types.GridRecord:
+        """A stored grid with its lattice and guides. Raises GridNotFound."""
+        return self._client._run(calls.get_grid_call(grid_id))
+
+    def put(self, content: types.Grid | types.Guides) -> types.GridRecord:
+        """Stores a lattice, or the one that guides span. Raises InvalidGrid, FoldedGrid, InvalidGuides."""
+        return self._client._run(calls.put_grid_call(content))
+
+    def delete(self, grid_id: str) -> None:
+        """Forgets a grid. Raises GridNotFound."""
+        self._client._run(calls.delete_grid_call(grid_id))

@@ -1,0 +1,203 @@
+"""One stream without its input and output: what may be sent, what was answered, what is sent again.
+
+The caller feeds in frames and responses and carries out what it is told; see ``Stream`` and ``AsyncStream``.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+from unbend import _types as types
+from unbend._calls import from_record, to_correct, to_guides, to_rendering
+from unbend._errors import InvalidOption, ServerFault, StreamIdle, TooManyStreams, Unavailable, UnbendError
+from unbend._failures import of_frame
+from unbend._images import FrameLayout
+from unbend._retries import backoff_s
+from unbend.v1 import correction_pb2
+
+Request = correction_pb2.CorrectStreamRequest
+Response = correction_pb2.CorrectStreamResponse
+
+WHILE_ESTIMATING = {
+    "hold": correction_pb2.WHILE_ESTIMATING_HOLD,
+    "pass_through": correction_pb2.WHILE_ESTIMATING_PASS_THROUGH,
+}
+DELIVERIES = {"lossless": correction_pb2.DELIVERY_LOSSLESS, "latest": correction_pb2.DELIVERY_LATEST}
+STATUSES = {
+    correction_pb2.FRAME_STATUS_CORRECTED: types.FrameStatus.CORRECTED,
+    correction_pb2.FRAME_STATUS_PASSED_THROUGH: types.FrameStatus.PASSED_THROUGH,
+    correction_pb2.FRAME_STATUS_DROPPED: types.FrameStatus.DROPPED,
+    correction_pb2.FRAME_STATUS_FAILED: types.FrameStatus.FAILED,
+}
+#: Before the server has ever answered it is not a broken stream that has to be mended, but perhaps a wrong address.
+_ATTEMPTS_TO_OPEN = 3
+
+
+@dataclass(frozen=True, slots=True)
+class StreamOptions:
+    """As :meth:`unbend.Client.stream` takes them."""
+
+    stream_id: str | None = None
+    correct: str = "nonlinear"
+    fit: str | float = "crop"
+    strength: float = 1.0
+    border: types.Border | None = None
+    quality: int | None = None
+    grid: str | types.GridRecord | types.Estimate | types.Guides | None = None
+    frames: int | None = None
+    while_estimating: str = "hold"
+    delivery: str = "lossless"
+    min_confidence: float | None = None
+    estimate_again: bool = False
+    in_flight: int = 8
+    reconnects: int = 8
+
+    def opening(self, layout: FrameLayout) -> correction_pb2.StreamOpen:
+        """The first message of the stream. Raises InvalidOption."""
+        for name, value, known in (
+            ("while_estimating", self.while_estimating, WHILE_ESTIMATING),
+            ("delivery", self.delivery, DELIVERIES),
+        ):
+            if value not in known:
+                raise InvalidOption(f"{name}={value!r} is not known.", allowed=", ".join(known))
+        if self.in_flight < 1:
+            raise InvalidOption(f"in_flight={self.in_flight} is out of range.", allowed="1 and more")
+        if self.frames is not None and not 1 <= self.frames <= 64:
+            raise InvalidOption(f"frames={self.frames} is out of range.", allowed="1..64")
+        message = correction_pb2.StreamOpen(
+            stream_id=self.stream_id or "",
+            format=layout.message,
+            correct=to_correct(self.correct),
+            rendering=to_rendering(self.fit, self.strength, self.border, self.quality),
+            while_estimating=WHILE_ESTIMATING[self.while_estimating],
+            delivery=DELIVERIES[self.delivery],
+            min_confidence=self.min_confidence,
+            estimate_again=self.estimate_again,
+        )
+        match self.grid:
+            case None:
+                message.estimate.frames = self.frames or 0
+            case str(grid_id):
+                message.grid_id = grid_id
+            case types.GridRecord() | types.Estimate():
+                message.grid_id = self.grid.grid_id
+            case types.Guides():
+                message.guides.CopyFrom(to_guides(self.grid))
+            case _:
+                raise InvalidOption(
+                    f"A stream cannot take a {type(self.grid).__name__} for its grid.",
+                    allowed="an id, a record, an estimate or guides; client.grids.put makes a record of a lattice",
+                )
+        return message
+
+
+@dataclass(frozen=True, slots=True)
+class _Sent:
+    """A frame that is not answered yet, as it was sent, and the shape of its array."""
+
+    message: correction_pb2.StreamFrame
+    shape: tuple[int, ...] | None
+
+
+class StreamCore:
+    """Numbers frames, keeps them until they are answered, and checks that each is answered once and in order."""
+
+    def __init__(self, layout: FrameLayout, options: StreamOptions) -> None:
+        self._layout = layout
+        self._opening = options.opening(layout)
+        self._window = options.in_flight
+        self._reconnects = options.reconnects
+        self._unanswered: deque[_Sent] = deque()
+        self._next_index = 0
+        self._failures = 0
+        self.opened = False
+        self.resumed = False
+        self.grid: types.GridRecord | None = None
+
+    @property
+    def stream_id(self) -> str:
+        return self._opening.stream_id
+
+    @property
+    def has_room(self) -> bool:
+        """Whether another frame may be sent before an answer."""
+        return len(self._unanswered) < self._window
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether an answer is due."""
+        return bool(self._unanswered)
+
+    def first(self) -> list[Request]:
+        """What a connection begins with: the opening, and the frames that no connection before it has answered."""
+        return [Request(open=self._opening), *(Request(frame=sent.message) for sent in self._unanswered)]
+
+    def accept(self, image: types.Image, timestamp_us: int) -> Request:
+        """The message of the next frame. Raises InvalidFrame."""
+        packed = self._layout.pack(image)
+        message = correction_pb2.StreamFrame(index=self._next_index, timestamp_us=timestamp_us, data=packed.data)
+        self._next_index += 1
+        self._unanswered.append(_Sent(message, packed.shape))
+        return Request(frame=message)
+
+    def forget(self) -> None:
+        """Nobody waits any more for the frames that are not answered; the connection has to be given up with them."""
+        self._unanswered.clear()
+
+    def receive(self, response: Response) -> types.StreamResult | None:
+        """What a response says to the caller, if anything. Raises ServerFault for one that should not have come."""
+        match response.WhichOneof("message"):
+            case "opened":
+                self._open(response.opened)
+            case "grid":
+                self.grid = from_record(response.grid.record)
+                self._opening.estimate_again = False  # it was; a resumed stream keeps the grid
+            case "result":
+                return self._answer(response.result)
+            case _:
+                raise ServerFault("The server sent a message that is not known here.")
+        return None
+
+    def lost(self, error: UnbendError | None) -> float:
+        """The connection ended, by itself (None) or with an error: the pause in seconds before the next one.
+
+        Raises:
+            UnbendError: the error, if another connection would not help or enough were tried without an answer.
+        """
+        if error is None:
+            if not self._unanswered:
+                return 0.0
+            error = ServerFault("The server ended the stream before it had answered every frame.")
+        if not isinstance(error, Unavailable | StreamIdle | TooManyStreams):
+            raise error
+        self._failures += 1
+        if self._failures > (self._reconnects if self.opened else min(self._reconnects, _ATTEMPTS_TO_OPEN)):
+            raise error
+        return max(backoff_s(self._failures), error.retry_after_s or 0.0)
+
+    def _open(self, message: correction_pb2.StreamOpened) -> None:
+        self.opened = True
+        self.resumed = message.resumed
+        self._opening.stream_id = message.stream_id
+        self._window = max(1, min(self._window, message.max_in_flight or self._window))
+
+    def _answer(self, message: correction_pb2.StreamResult) -> types.StreamResult:
+        if not self._unanswered or message.index != self._unanswered[0].message.index:
+            raise ServerFault(f"The server answered frame {message.index}, which is not the next one.")
+        sent = self._unanswered.popleft()
+        self._failures = 0
+        if message.status not in STATUSES:
+            raise ServerFault(f"The server answered with the frame status {message.status}, which is not known here.")
+        status = STATUSES[message.status]
+        image, error = None, None
+        if status is types.FrameStatus.FAILED:
+            error = of_frame(message.error.code, message.error.message)
+        elif status is not types.FrameStatus.DROPPED:
+            image = self._layout.unpack(message.data, sent.shape)
+        return types.StreamResult(sent.message.index, sent.message.timestamp_us, status, image, error)
+
+
+def split(item: types.Image | tuple[types.Image, int]) -> tuple[types.Image, int]:
+    """A frame and its timestamp in microseconds, 0 if it came without."""
+    return item if isinstance(item, tuple) else (item, 0)

@@ -1,0 +1,209 @@
+"""What goes into the client and comes out of it.
+
+Frames of reference: every coordinate is centred, x = 2 (i + 0.5) / width - 1 to the right and y = 2 (j + 0.5) / height
+- 1 down, so that a picture is [-1, 1]^2. "Source" is the distorted picture, "target" the corrected one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from unbend._errors import InvalidGrid, UnbendError
+
+#: A picture: (height, width[, channels]) uint8, or the bytes of an image file.
+Image = npt.NDArray[np.uint8] | bytes
+
+
+class Outcome(StrEnum):
+    """Whether a picture was changed."""
+
+    CORRECTED = "corrected"
+    LEFT_ALONE = "left_alone"
+
+
+class FrameStatus(StrEnum):
+    """What became of a frame of a stream."""
+
+    CORRECTED = "corrected"
+    PASSED_THROUGH = "passed_through"
+    DROPPED = "dropped"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True, slots=True)
+class Border:
+    """What is painted where the source has nothing; 0..255 each, alpha where the format has it."""
+
+    red: int = 0
+    green: int = 0
+    blue: int = 0
+    alpha: int = 255
+
+
+@dataclass(frozen=True, slots=True)
+class Guide:
+    """One polynomial guide.
+
+    Attributes:
+        anchor: where it lies once straight, centred target coordinate in (-1, 1).
+        coefficients: c0, c1, ... in centred source coordinates; of a row guide y = c0 + c1 x + c2 x^2 + ..., of a
+            column guide x = c0 + c1 y + c2 y^2 + .... Undistorted: (anchor, 0, 0, ...).
+    """
+
+    anchor: float
+    coefficients: Sequence[float]
+
+
+@dataclass(frozen=True, slots=True)
+class Guides:
+    """The curves that ought to be straight: at least two near-horizontal ones and two near-vertical ones."""
+
+    rows: Sequence[Guide]
+    columns: Sequence[Guide]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Grid:
+    """A lattice of source points for a regular lattice over the target, the backward map of the correction.
+
+    Attributes:
+        source: (rows, columns, 2) float32, 2..1025 rows and columns, centred: ``source[r, c] = (x, y)`` is the source
+            point of the target point (2 c / (columns - 1) - 1, 2 r / (rows - 1) - 1).
+
+    Raises:
+        InvalidGrid: another shape.
+    """
+
+    source: npt.NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        source = np.ascontiguousarray(self.source, dtype=np.float32)
+        if source.ndim != 3 or source.shape[2] != 2:
+            raise InvalidGrid(f"A grid of shape {source.shape}.", allowed="(rows, columns, 2)")
+        object.__setattr__(self, "source", source)
+
+    @property
+    def rows(self) -> int:
+        return int(self.source.shape[0])
+
+    @property
+    def columns(self) -> int:
+        return int(self.source.shape[1])
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class GridRecord:
+    """A grid and where it came from.
+
+    Attributes:
+        grid_id: content-derived; stands for the grid in later calls.
+        confidence: 0..1; ``confidence_kind`` says what it means (``mirror_agreement``, ``calibrated_probability`` or
+            ``given``).
+        outcome: whether the grid changes anything; if not, ``reason`` says why (``low_confidence``,
+            ``nothing_to_correct`` or ``folded``).
+        strength: share of the estimated correction that is in the grid.
+        model: name of the network that estimated, empty for grids that came from elsewhere.
+        grid: the lattice; None where only the id was asked for.
+        guides: the guides it was spun from; None where there are none or only the id was asked for.
+    """
+
+    grid_id: str
+    confidence: float
+    confidence_kind: str
+    outcome: Outcome
+    reason: str
+    strength: float
+    model: str
+    grid: Grid | None = field(default=None, repr=False)
+    guides: Guides | None = field(default=None, repr=False)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Estimate:
+    """How one picture is bent.
+
+    Attributes:
+        record: what is stored on the server under ``grid_id``, lattice and guides included.
+    """
+
+    record: GridRecord
+
+    @property
+    def grid_id(self) -> str:
+        return self.record.grid_id
+
+    @property
+    def confidence(self) -> float:
+        return self.record.confidence
+
+    @property
+    def outcome(self) -> Outcome:
+        return self.record.outcome
+
+    @property
+    def reason(self) -> str:
+        return self.record.reason
+
+    @property
+    def grid(self) -> Grid:
+        assert self.record.grid is not None
+        return self.record.grid
+
+    @property
+    def guides(self) -> Guides | None:
+        return self.record.guides
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Correction:
+    """One corrected picture.
+
+    Attributes:
+        image: an array of the shape that was sent, or the bytes of a file if a file was sent.
+        record: the grid behind it, before fit and strength; without lattice and guides.
+    """
+
+    image: Any = field(repr=False)
+    record: GridRecord
+
+    @property
+    def grid_id(self) -> str:
+        return self.record.grid_id
+
+    @property
+    def confidence(self) -> float:
+        return self.record.confidence
+
+    @property
+    def outcome(self) -> Outcome:
+        return self.record.outcome
+
+    @property
+    def reason(self) -> str:
+        return self.record.reason
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class StreamResult:
+    """The answer to one frame.
+
+    Attributes:
+        index: number of the frame in its stream, from 0.
+        timestamp_us: as it was sent.
+        status: what became of it.
+        image: like the frame that was sent: an array of its shape (read-only: copy it to draw on it) or bytes; None
+            for a frame that was dropped or failed.
+        error: why it failed; None otherwise.
+    """
+
+    index: int
+    timestamp_us: int
+    status: FrameStatus
+    image: Any = field(default=None, repr=False)
+    error: UnbendError | None = None
