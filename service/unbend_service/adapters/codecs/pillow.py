@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import threading
 import warnings
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -269,7 +270,8 @@ def _options(image: DecodedImage, image_format: str, quality: int) -> dict[str, 
         return {"quality": quality, "subsampling": image.chroma_subsampling or "4:2:0"}
     if image_format == "webp":
         return {"quality": quality, "method": 2}
-    return {"compress_level": 3}
+    # run lengths only: on photographs half the time of the default for a few per cent of size
+    return {"compress_level": 1, "compress_type": zlib.Z_RLE}
 
 
 def _subsampling(image: Image.Image) -> str | None:
