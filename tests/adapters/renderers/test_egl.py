@@ -5,10 +5,13 @@ import os
 import numpy as np
 import pytest
 
+from tests.fakes import RecordingMeter
 from unbend_service.adapters.renderers.egl import EglRenderer
-from unbend_service.domain.errors import RendererUnavailable
+from unbend_service.adapters.renderers.pool import WorkerPool
+from unbend_service.domain.errors import RendererUnavailable, RenderFailed
 from unbend_service.domain.frames import BLACK, Frame, PixelFormat
 from unbend_service.domain.grid import Grid
+from unbend_service.settings import Settings
 
 pytestmark = pytest.mark.egl
 
@@ -49,3 +52,33 @@ def test_a_device_that_is_not_there_says_how_to_mend_it() -> None:
     opened().close()
     with pytest.raises(RendererUnavailable, match=r"EGL device 200 .* Install libegl1"):
         EglRenderer(device=200)
+
+
+def test_an_error_of_opengl_is_an_error_of_the_frame() -> None:
+    """Nothing that OpenGL complains of passes for a picture; the next frame is judged anew."""
+    renderer = opened()
+    frame = Frame(PixelFormat.GRAY8, 7, 5, np.arange(35, dtype=np.uint8))
+    target = np.empty_like(frame.data)
+    renderer._context.enable_direct(0xFFFF)  # a switch that does not exist
+    with pytest.raises(RenderFailed, match="GL_INVALID_ENUM"):
+        renderer.render(frame, Grid.identity(), BLACK, target)
+    renderer.render(frame, Grid.identity(), BLACK, target)
+    np.testing.assert_array_equal(target, frame.data)
+    renderer.close()
+
+
+async def test_workers_render_with_egl() -> None:
+    """The pool gives the same picture with EGL in its workers as the renderer does here, and names the device."""
+    frame = Frame(PixelFormat.I420, 64, 36, np.random.default_rng(0).integers(0, 256, 3456, np.uint8))
+    grid = Grid.from_map(lambda p: p * (1.1 - 0.1 * (p**2).sum(axis=-1, keepdims=True)))
+    renderer = opened()
+    expected = np.empty_like(frame.data)
+    renderer.render(frame, grid, BLACK, expected)
+    pool = WorkerPool(Settings(renderer="egl", workers=1), RecordingMeter())
+    await pool.start()
+    try:
+        np.testing.assert_array_equal(await pool.render(frame, grid, BLACK), expected)
+        assert pool.state().renderer == renderer.info
+    finally:
+        await pool.close(1)
+        renderer.close()

@@ -311,3 +311,14 @@ async def test_a_required_gpu_that_is_missing_stops_the_start(meter: RecordingMe
     with pytest.raises(RendererUnavailable, match="GPU is required"):
         await pool.start()
     assert worker_processes() == []
+
+
+async def test_closing_during_the_start_ends_it(meter: RecordingMeter) -> None:
+    """Who stops a service that is still starting does not wait for it."""
+    pool = WorkerPool(Settings(renderer="cpu", workers=1), meter)
+    starting = asyncio.create_task(pool.start())
+    await until(lambda: bool(worker_processes()))
+    await pool.close(5)
+    with pytest.raises(RendererUnavailable, match="shut down"):
+        await starting
+    assert worker_processes() == []

@@ -16,7 +16,7 @@ from unbend_service.domain.errors import InvalidFrame, RendererUnavailable, Rend
 from unbend_service.domain.frames import Border, Frame, Plane, planes
 from unbend_service.domain.grid import Grid
 
-_SOFTWARE = ("llvmpipe", "softpipe", "swiftshader", "swrast")
+_SOFTWARE = ("llvmpipe", "softpipe", "swiftshader", "swrast", "basic render")
 _GL_DITHER = 0x0BD0
 _REMEDY = (
     "Install libegl1 and a driver (Mesa: libgl1-mesa-dri; NVIDIA in a container: NVIDIA_DRIVER_CAPABILITIES with "
@@ -104,8 +104,6 @@ class EglRenderer:
             raise RendererUnavailable(
                 f"EGL device {device} gives no OpenGL 3.3 context ({error}). {_REMEDY}.", setting="renderer"
             ) from error
-        EglRenderer._open = True
-        self._closed = False
         self._context.disable_direct(_GL_DITHER)
         self._longest_px = int(
             min(self._context.info["GL_MAX_TEXTURE_SIZE"], *self._context.info["GL_MAX_VIEWPORT_DIMS"])
@@ -114,6 +112,8 @@ class EglRenderer:
         self._surfaces: Recent[tuple[int, int, int], _Surface] = Recent(cache_bytes, _Surface.release)
         self._meshes: Recent[str, _Mesh] = Recent(cache_bytes, _Mesh.release)
         self._info = self._describe()
+        self._closed = False
+        EglRenderer._open = True
 
     @property
     def info(self) -> RendererInfo:

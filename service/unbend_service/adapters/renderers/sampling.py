@@ -94,18 +94,22 @@ class PlaneSampling:
         row, v = self._cells(np.arange(first, end), self.frame_height_px, grid.rows)
         lattice = self.displacement(grid)[row[0] : row[-1] + 2]
         row -= row[0]
-        maps = []
-        own = (np.arange(self.width, dtype=np.float32), np.arange(first, end, dtype=np.float32)[:, None])
         bands = np.append(np.flatnonzero(np.diff(row, prepend=-1)), len(row))
+        own_y = np.arange(first, end, dtype=np.float32)[:, None]
+        maps = []
         for axis in range(2):
             points = lattice[..., axis]
             across = points[:, column] * (1 - u) + points[:, column + 1] * u
+            if axis == 0:
+                across += np.arange(self.width, dtype=np.float32)
             dense = np.empty((end - first, self.width), dtype=np.float32)
+            # one band lies between two rows of the lattice, and is small enough to stay in the processor's cache
             for start, stop in pairwise(bands):
-                top, bottom = across[row[start]], across[row[start] + 1]
-                np.multiply(v[start:stop, None], bottom - top, out=dense[start:stop])
-                dense[start:stop] += top
-            dense += own[axis]
+                top, bottom, band = across[row[start]], across[row[start] + 1], dense[start:stop]
+                np.multiply(v[start:stop, None], bottom - top, out=band)
+                band += top
+                if axis == 1:
+                    band += own_y[start:stop]
             maps.append(dense)
         return maps[0], maps[1]
 

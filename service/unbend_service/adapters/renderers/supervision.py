@@ -165,6 +165,8 @@ class Supervisor:
     async def close(self) -> None:
         """Ends every worker: an idle one by itself, one at work by force."""
         self._closed = True
+        if self._first is not None and not self._first.done():
+            self._first.set_exception(RendererUnavailable("The renderers were shut down before they had started."))
         for place in self._places:
             place.stop_timer()
             if place.worker is not None:

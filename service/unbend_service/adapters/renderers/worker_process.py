@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections import OrderedDict, deque
 from collections.abc import Iterable
+from contextlib import suppress
 
 import numpy as np
 
@@ -58,7 +59,8 @@ class WorkerProcess:
             raise
         finally:
             theirs.close()
-        self.channel.send(Begin(f"unbend-render{index}", factory, options))
+        with suppress(OSError):  # it is gone already, as the channel will show
+            self.channel.send(Begin(f"unbend-render{index}", factory, options))
 
     @property
     def pid(self) -> int:
