@@ -15,7 +15,7 @@ from unbend_service.domain.frames import Border, Frame
 from unbend_service.domain.grid import Grid
 
 DRAW, SLEEP, DIE, DIE_ONCE, HANG, RAISE, WHO, HANG_ONCE = range(8)
-SLEEP_S = 0.3
+SLEEP_S = 0.5
 
 
 class MisbehavingRenderer:

@@ -115,7 +115,7 @@ async def test_no_worker_idles_while_a_frame_waits(make_pool: MakePool) -> None:
     pool = await make_pool(workers=2)
     shares = Counter(await asyncio.gather(*(who(pool, "stream") for _ in range(20))))
     assert len(shares) == 2
-    assert min(shares.values()) >= 6
+    assert min(shares.values()) >= 4
 
 
 async def test_a_full_queue_refuses_at_once(make_pool: MakePool) -> None:
@@ -159,7 +159,7 @@ async def test_a_short_deadline_kills_no_worker(make_pool: MakePool, meter: Reco
 
 async def test_a_hung_worker_is_replaced(make_pool: MakePool, meter: RecordingMeter) -> None:
     """The caller of the frame that hangs gets DeadlineExceeded; the pool renders on."""
-    pool = await make_pool(render_deadline_s=0.5)
+    pool = await make_pool(render_deadline_s=1.0)
     with pytest.raises(DeadlineExceeded):
         await pool.render(frame(misbehaving.HANG), GRID, BLACK)
     await until(lambda: meter.restarts["hung"] == 1)
@@ -169,7 +169,7 @@ async def test_a_hung_worker_is_replaced(make_pool: MakePool, meter: RecordingMe
 
 async def test_a_stopped_worker_is_replaced(make_pool: MakePool, meter: RecordingMeter) -> None:
     """A process that the system froze counts as hung."""
-    pool = await make_pool(render_deadline_s=0.5)
+    pool = await make_pool(render_deadline_s=1.0)
     pid = pool.state().workers[0].pid
     assert pid is not None
     os.kill(pid, signal.SIGSTOP)
