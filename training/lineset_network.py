@@ -8,7 +8,7 @@ After the founding rounds there is a first estimate. Each refinement round strai
 far (see `straightening`), tells every chain what became of it, pools again, and adds a correction: a learned
 Gauss-Newton step.
 
-Output: 48 node values (see `labels`), isotropic frame, as coefficients of a fixed, scaled principal basis around the
+Output: 72 node values (see `labels`), isotropic frame, as coefficients of a fixed, scaled principal basis around the
 straight guides; and, from a head whose gradient stops at its input, log scales of their errors.
 """
 
@@ -136,12 +136,12 @@ class LinesetNetwork(nn.Module):
             nn.init.zeros_(correction[2].weight)
 
     def forward(self, features: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """features (B, N, F), mask (B, N) float, 1 where a chain is -> node values (B, 48), spreads (B, 50)."""
+        """features (B, N, F), mask (B, N) float, 1 where a chain is -> node values (B, 72), spreads (B, 74)."""
         estimates, spreads = self.estimates(features, Layout(mask))
         return estimates[-1], spreads
 
     def estimates(self, features: Tensor, layout: Layout) -> tuple[list[Tensor], Tensor]:
-        """Node values (B, 48) after the founding rounds and after each refinement, and the spreads of the last.
+        """Node values (B, 72) after the founding rounds and after each refinement, and the spreads of the last.
 
         features: (B, N, F), or packed (m, F), as the layout says.
         """

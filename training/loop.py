@@ -71,7 +71,7 @@ def new_checkpoint(sampler: Sampler, shape: NetworkShape, seed: int, inherit_fro
 
 
 def _principal_basis(labels: np.ndarray[Any, Any]) -> Tensor:
-    """(48, 48): principal directions of the labels around the straight guides, scaled by their deviations."""
+    """(72, 72): principal directions of the labels around the straight guides, scaled by their deviations."""
     offsets = (labels - STRAIGHT).clip(-1.2, 1.2)
     values, vectors = np.linalg.eigh(offsets.T @ offsets / len(offsets) + 1e-7 * np.eye(VALUES))
     return torch.tensor(vectors * np.sqrt(np.maximum(values, 0.008**2)), dtype=torch.float32)

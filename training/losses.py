@@ -5,7 +5,7 @@ linear in the node values; one Newton step with a detached Jacobian turns them i
 guides' map misses the source point. No iteration, no fold to fear.
 
 Nonlinear part. The same displacement after its weighted projection on the eight tangents of target-side homographies,
-transported into the source by the true map's Jacobian: what remains is what bends straight lines.
+transported into the source: what remains is what bends straight lines.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Truth:
         self._project = torch.linalg.solve(normal, weighted.transpose(1, 2))
 
     def misses(self, values: Tensor) -> Tensor:
-        """Displacement (B, 2 n), px, x then y, by which guides with node values (B, 48) miss the source points."""
+        """Displacement (B, 2 n), px, x then y, by which guides with node values (B, 72) miss the source points."""
         half = values.shape[1] // 2
         rows = torch.bmm(self._over_rows, values[:, :half].reshape(len(values), len(ANCHORS), -1))
         columns = torch.bmm(self._over_columns, values[:, half:].reshape(len(values), len(ANCHORS), -1))
@@ -89,7 +89,12 @@ class Truth:
 
 
 def _homography_tangents(s: Tensor, t: Tensor, slopes: Tensor) -> Tensor:
-    """Source displacements (B, 2 n, 8) that the eight infinitesimal homographies of the target cause, x then y."""
+    """Source displacements (B, 2 n, 8) that the eight infinitesimal homographies of the target cause, x then y.
+
+    They ought to go through the Jacobian of the estimated map, which lies between that of doing nothing and the true
+    one (a pincushion's residual, measured after a real alignment, exceeds what the true Jacobian leaves by half).
+    """
+    slopes = (2 / 3) * torch.eye(2) + (1 / 3) * slopes
     zero, one = torch.zeros_like(s), torch.ones_like(s)
     in_s = torch.stack([one, zero, s, zero, t, zero, s * s, s * t], -1)
     in_t = torch.stack([zero, one, zero, s, zero, t, s * t, t * t], -1)
@@ -108,10 +113,12 @@ def spread_loss(
 ) -> Tensor:
     """Negative log-likelihood of the predicted scales: Laplace for each coefficient, exponential for the errors.
 
-    Everything but `spreads` is detached, so the scales learn from the guides and never against them.
+    Labels are those of the first samples only. Everything but `spreads` is detached, so the scales learn from the
+    guides and never against them.
     """
-    misfit = ((labels - values.detach()) @ inverse_basis.t()).clamp(-30, 30).abs()
-    log_scale = spreads[:, :-2].clamp(-7, 4)
+    known = len(labels)
+    misfit = ((labels - values[:known].detach()) @ inverse_basis.t()).clamp(-30, 30).abs()
+    log_scale = spreads[:known, :-2].clamp(-7, 4)
     coefficients = (misfit * torch.exp(-log_scale) + log_scale).mean()
     log_overall, log_nonlinear = spreads[:, -2].clamp(-4, 5), spreads[:, -1].clamp(-4, 5)
     means = overall.detach() * torch.exp(-log_overall) + log_overall

@@ -1,8 +1,8 @@
 """Training samples: stored chains, seen through a random lens by an imperfect extractor.
 
 No image is warped. A sample picks a picture of the store and a window of it, pushes the chain points of the window
-through a random distortion (exactly, `distortions.bend`), and imitates what extraction would have done to them: chains
-missed altogether or for want of contrast, a blank region, breaks, jitter, and the border it does not search.
+through a random distortion (exactly, `distortions.bend`), and imitates what extraction would have done to them
+(`imperfection`).
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy.typing as npt
 from training.chain_store import DRAWN, LEVELS, QUANTUM, ChainStore
 from training.distortions import DistortionBatch
 from training.homographies import natural_tilts
+from training.imperfection import FlatPoints, at_the_right_level, found, jitter
 from training.labels import evaluation_points, evaluation_weights, fit_labels
 from training.random_distortions import draw_distortions
 from unbend_service.adapters.estimators.chain_features import ChainDescriptions, ChainPoints, describe
@@ -28,6 +29,8 @@ Bools = npt.NDArray[np.bool_]
 SEARCHED_LONG_SIDE_PX = (256.0, 384.0)
 """Long side, in pixels, of the picture that the imitated extractor searches."""
 UNSEARCHED_BORDER_PX = 5.0
+LABELLED_SHARE = 4
+"""Only the scales of the coefficients' errors are learned from labels, and fitting them is slow: one sample of four."""
 COARSEST_ZOOM = 0.6
 """Photograph pixels per pixel of a 256 frame: windows may be enlarged this much, as small crops are."""
 _SEE_MARGIN = 0.07
@@ -39,7 +42,8 @@ class TrainingBatch:
     """One batch.
 
     chains: the network's input. source, target: float32 (B, n, 2), correspondences in the isotropic frame; weight:
-    float32 (B, n). slopes: float32 (B, n, 2, 2), d source / d target. labels: float32 (B, 48) fitted node values.
+    float32 (B, n). slopes: float32 (B, n, 2, 2), d source / d target. labels: float32 (L, 72),
+    fitted node values of the first L = B / LABELLED_SHARE samples.
     kind: int (B,) index into random_distortions.KINDS.
     """
 
@@ -54,13 +58,18 @@ class TrainingBatch:
 
 @dataclass(frozen=True)
 class _Windows:
-    """How stored chains become a sample's: entry (B,) of the store; isotropic picture coordinates times scale (B,)
-    plus shift (B, 2) are isotropic target coordinates; pixel (B,), isotropic size of a searched pixel."""
+    """How stored chains become a sample's.
 
-    entry: Ints
+    picture: (B,) of the store. level: (B,), the scale of that picture at which its pixels are those of the sample.
+    Isotropic picture coordinates times scale (B,) plus shift (B,) are isotropic target coordinates.
+    pixel: (B,), isotropic size of a searched pixel.
+    """
+
+    picture: Ints
+    level: Float32
     scale_x: Float32
     scale_y: Float32
-    shift: Float32
+    shift: tuple[Float32, Float32]
     pixel: Float32
 
 
@@ -89,7 +98,8 @@ class Sampler:
         target_x, target_y = distortions.straighten(source_x, source_y)
         slopes, area = _slopes(distortions, source_x, source_y)
         weight = evaluation_weights(target_x, target_y, area, half_extent)
-        labels = fit_labels(source_x, source_y, target_x, target_y, weight)
+        some = slice(0, max(1, size // LABELLED_SHARE))
+        labels = fit_labels(source_x[some], source_y[some], target_x[some], target_y[some], weight[some])
         target = np.stack([target_x, target_y], -1).clip(-3, 3)
         return TrainingBatch(
             chains=describe(points),
@@ -110,24 +120,34 @@ class Sampler:
         return np.stack([np.where(portrait, short, 1.0), np.where(portrait, 1.0, short)], 1)
 
     def _points(self, distortions: DistortionBatch, half_extent: Float64, rng: np.random.Generator) -> ChainPoints:
-        low, high = _target_bounds(distortions, half_extent)
+        low, high, stretch = _target_view(distortions, half_extent)
         windows = self._windows(low, high, rng)
-        x, y, strength, starts, sample = self._gather(windows.entry)
-        x = x * windows.scale_x[sample] + windows.shift[sample, 0]
-        y = y * windows.scale_y[sample] + windows.shift[sample, 1]
-        low, high = (low - _SEE_MARGIN).astype(np.float32), (high + _SEE_MARGIN).astype(np.float32)
-        near = (x > low[sample, 0]) & (x < high[sample, 0]) & (y > low[sample, 1]) & (y < high[sample, 1])
-        x, y, strength, sample, starts = _kept(near, x, y, strength, sample, starts)
-        x, y = _tilted(natural_tilts(distortions.size, self._tilt_share, rng), x, y, sample)
-        x, y, visible = distortions.bend(x, y, sample)
-        visible &= _extracted(x, y, strength, starts, sample, half_extent, rng)
-        jitter = _jitter(windows.pixel, rng)[sample]
-        x = x + jitter * rng.standard_normal(len(x), dtype=np.float32)
-        y = y + jitter * rng.standard_normal(len(x), dtype=np.float32)
-        inner = half_extent.astype(np.float32) - np.float32(UNSEARCHED_BORDER_PX) * windows.pixel[:, None]
-        visible &= (np.abs(x) < inner[sample, 0]) & (np.abs(y) < inner[sample, 1])
-        x, y, strength, sample, starts = _kept(visible, x, y, strength, sample, starts)
-        return ChainPoints(x, y, strength, starts, sample, half_extent.astype(np.float32), windows.pixel)
+        points = self._gathered(windows, stretch)
+        left, top = _columns(low - _SEE_MARGIN)
+        right, bottom = _columns(high + _SEE_MARGIN)
+        x, y, sample = points.x, points.y, points.sample
+        points = points.kept((x > left[sample]) & (x < right[sample]) & (y > top[sample]) & (y < bottom[sample]))
+        tilts = natural_tilts(distortions.size, self._tilt_share, rng)
+        points = points.moved(*_tilted(tilts, points.x, points.y, points.sample))
+        points, blur = at_the_right_level(points, distortions, windows.level)
+        x, y, visible = distortions.bend(points.x, points.y, points.sample)
+        points = points.moved(x, y)
+        visible &= found(points, half_extent, rng)
+        noise = jitter(windows.pixel, rng)[points.sample] * blur
+        x = x + noise * rng.standard_normal(len(x), dtype=np.float32)
+        y = y + noise * rng.standard_normal(len(x), dtype=np.float32)
+        inner_x, inner_y = _columns(half_extent - UNSEARCHED_BORDER_PX * windows.pixel[:, None])
+        visible &= (np.abs(x) < inner_x[points.sample]) & (np.abs(y) < inner_y[points.sample])
+        seen = points.moved(x, y).kept(visible).by_sample()
+        return ChainPoints(
+            x=seen.x,
+            y=seen.y,
+            strength=seen.strength,
+            starts=seen.starts,
+            picture=seen.sample,
+            half_extent=half_extent.astype(np.float32),
+            pixel=windows.pixel,
+        )
 
     def _windows(self, low: Float64, high: Float64, rng: np.random.Generator) -> _Windows:
         """Where in which picture each sample looks, so that it sees the target rectangle low..high (B, 2)."""
@@ -142,16 +162,15 @@ class Sampler:
         smallest, largest = SEARCHED_LONG_SIDE_PX
         varied = smallest * (largest / smallest) ** rng.random(size)
         searched = np.where(rng.random(size) < 0.5, smallest, varied)
-        wanted_level = searched / 2 / zoom * np.exp(0.12 * rng.normal(size=size))
-        level = np.abs(np.log(wanted_level[:, None] / np.array(LEVELS))).argmin(1)
         corner_px = 1 - extent_px / 2 + rng.random((size, 2)) * (extent_px - 2 - zoom[:, None] * span)
         scale = extent_px.max(1) / 2 / zoom
         mirrored = np.where(rng.random(size) < 0.5, -1, 1)
         return _Windows(
-            entry=picture * len(LEVELS) + level,
+            picture=picture,
+            level=np.asarray(searched / 2 / zoom * np.exp(0.12 * rng.normal(size=size)), np.float32),
             scale_x=(scale * mirrored).astype(np.float32),
             scale_y=scale.astype(np.float32),
-            shift=(low - corner_px / zoom[:, None]).astype(np.float32),
+            shift=_columns(low - corner_px / zoom[:, None]),
             pixel=(2 / searched).astype(np.float32),
         )
 
@@ -164,28 +183,50 @@ class Sampler:
         photographs = self._photographs[rng.integers(len(self._photographs), size=size)]
         return np.where(rng.random(size) < self._drawn_share, drawn, photographs)
 
-    def _gather(self, entries: Ints) -> tuple[Float32, Float32, Float32, Bools, Ints]:
-        """The points of store entries (B,), flat: x, y (isotropic frame of the picture), strength, starts, sample."""
-        first, last = self._store.offsets[entries], self._store.offsets[entries + 1]
+    def _gathered(self, windows: _Windows, stretch: Float64) -> FlatPoints:
+        """The stored chains of all levels that a sample may show, in its target frame; stretch: (B, 2), least and
+        greatest magnification of the distortion."""
+        levels = np.log(np.array(LEVELS))
+        nearest = [
+            np.abs(np.log(windows.level * bound)[:, None] - levels).argmin(1)
+            for bound in (stretch[:, 1], stretch[:, 0])
+        ]
+        sample, level = np.nonzero(
+            (np.arange(len(LEVELS)) >= nearest[0][:, None]) & (np.arange(len(LEVELS)) <= nearest[1][:, None])
+        )
+        entry = windows.picture[sample] * len(LEVELS) + level
+        first, last = self._store.offsets[entry], self._store.offsets[entry + 1]
         slices = [slice(a, b) for a, b in zip(first.tolist(), last.tolist(), strict=True)]
-        sample = np.repeat(np.arange(len(entries)), last - first)
-        return (
-            np.concatenate([self._x[s] for s in slices]),
-            np.concatenate([self._y[s] for s in slices]),
-            np.concatenate([self._strength[s] for s in slices]),
-            np.concatenate([self._store.starts[s] for s in slices]),
-            sample,
+        count = last - first
+        owner = np.repeat(sample, count)
+        x, y, strength, starts = (
+            np.concatenate([a[s] for s in slices]) for a in (self._x, self._y, self._strength, self._store.starts)
+        )
+        return FlatPoints(
+            x=x * windows.scale_x[owner] + windows.shift[0][owner],
+            y=y * windows.scale_y[owner] + windows.shift[1][owner],
+            strength=strength,
+            starts=starts,
+            sample=owner,
+            level=np.repeat(level, count),
         )
 
 
-def _target_bounds(distortions: DistortionBatch, half_extent: Float64) -> tuple[Float64, Float64]:
-    """Bounding box of what each picture shows, in its target frame: low, high (B, 2), within +-_BBOX_REACH."""
-    steps = np.linspace(-1, 1, 11)
+def _target_view(distortions: DistortionBatch, half_extent: Float64) -> tuple[Float64, Float64, Float64]:
+    """What each picture shows of its target frame: low and high corner (B, 2) of its bounding box, within
+    +-_BBOX_REACH; and the least and greatest magnification, source per target, (B, 2)."""
+    side = 11
+    steps = np.linspace(-1, 1, side)
     grid_x, grid_y = (a.ravel() for a in np.meshgrid(steps, steps))
     x, y = distortions.straighten(half_extent[:, :1] * grid_x, half_extent[:, 1:] * grid_y)
+    lattice = np.stack([x, y], -1).reshape(-1, side, side, 2)
+    along, down = lattice[:, :-1, 1:] - lattice[:, :-1, :-1], lattice[:, 1:, :-1] - lattice[:, :-1, :-1]
+    area = np.abs(along[..., 0] * down[..., 1] - along[..., 1] * down[..., 0]).reshape(len(x), -1)
+    cell = half_extent.prod(1)[:, None] * (2 / (side - 1)) ** 2
+    magnification = np.sqrt(cell / np.maximum(area, 1e-6)).clip(0.2, 5)
     x, y = x.clip(-_BBOX_REACH, _BBOX_REACH), y.clip(-_BBOX_REACH, _BBOX_REACH)
-    pad = 1 / 128
-    return np.stack([x.min(1) - pad, y.min(1) - pad], 1), np.stack([x.max(1) + pad, y.max(1) + pad], 1)
+    low, high = np.stack([x.min(1), y.min(1)], 1) - 1 / 128, np.stack([x.max(1), y.max(1)], 1) + 1 / 128
+    return low, high, np.stack([magnification.min(1), magnification.max(1)], 1)
 
 
 def _slopes(distortions: DistortionBatch, x: Float64, y: Float64) -> tuple[Float64, Float64]:
@@ -202,55 +243,20 @@ def _slopes(distortions: DistortionBatch, x: Float64, y: Float64) -> tuple[Float
 
 
 def _tilted(tilts: Float64, x: Float32, y: Float32, sample: Ints) -> tuple[Float32, Float32]:
-    entries = tilts.astype(np.float32)
-    depth = np.maximum(entries[sample, 2, 0] * x + entries[sample, 2, 1] * y + entries[sample, 2, 2], np.float32(0.2))
-    tilted_x = (entries[sample, 0, 0] * x + entries[sample, 0, 1] * y + entries[sample, 0, 2]) / depth
-    return tilted_x, (entries[sample, 1, 0] * x + entries[sample, 1, 1] * y + entries[sample, 1, 2]) / depth
+    """The points of samples whose tilt is not the identity, moved by it."""
+    moving = np.flatnonzero(np.abs(tilts - np.eye(3)).max((1, 2)) > 0)
+    index = np.flatnonzero(np.isin(np.arange(len(tilts)), moving)[sample])
+    entries = np.ascontiguousarray(tilts.transpose(1, 2, 0), np.float32)
+    owner, old_x, old_y = sample[index], x[index], y[index]
+    depth, new_x, new_y = (
+        entries[row, 0][owner] * old_x + entries[row, 1][owner] * old_y + entries[row, 2][owner] for row in (2, 0, 1)
+    )
+    depth = np.maximum(depth, np.float32(0.2))
+    x, y = x.copy(), y.copy()
+    x[index], y[index] = new_x / depth, new_y / depth
+    return x, y
 
 
-def _jitter(pixel: Float32, rng: np.random.Generator) -> Float32:
-    """Standard deviation (B,) of the noise added to each coordinate, isotropic; mostly small."""
-    share = np.where(rng.random(len(pixel)) < 0.7, 0.12, 0.35) * rng.random(len(pixel))
-    return (share * pixel).astype(np.float32)
-
-
-def _extracted(
-    x: Float32,
-    y: Float32,
-    strength: Float32,
-    starts: Bools,
-    sample: Ints,
-    half_extent: Float64,
-    rng: np.random.Generator,
-) -> Bools:
-    """Which points an imperfect extractor would still have found."""
-    size = len(half_extent)
-    chain = np.cumsum(starts) - 1
-    first = np.flatnonzero(starts)
-    owner = sample[first]
-    missed_share = np.where(rng.random(size) < 0.5, rng.random(size) * 0.5, 0.0)
-    missed = rng.random(len(first)) < missed_share[owner]
-    faint_share = np.where(rng.random(size) < 0.3, rng.random(size) * 0.5, 0.0)
-    order = np.lexsort((strength[first], owner))
-    number = np.bincount(owner, minlength=size)
-    rank = np.empty(len(first))
-    rank[order] = np.arange(len(first)) - np.repeat(np.cumsum(number) - number, number)
-    missed |= rank < faint_share[owner] * number[owner]
-    centre = rng.uniform(-1, 1, (size, 2)) * half_extent
-    radius = np.where(rng.random(size) < 0.15, rng.uniform(0.23, 0.86, size), 0.0)
-    away_x, away_y = x - centre[:, 0].astype(np.float32)[sample], y - centre[:, 1].astype(np.float32)[sample]
-    blank = away_x * away_x + away_y * away_y < (radius * radius).astype(np.float32)[sample]
-    break_share = np.where(rng.random(size) < 0.6, rng.random(size) * 0.04, 0.0).astype(np.float32)
-    broken = rng.random(len(x), dtype=np.float32) < break_share[sample]
-    return np.asarray(~(missed[chain] | blank | broken))
-
-
-def _kept(
-    keep: Bools, x: Float32, y: Float32, strength: Float32, sample: Ints, starts: Bools
-) -> tuple[Float32, Float32, Float32, Ints, Bools]:
-    """The points that stay, with a chain starting anew after each gap."""
-    chain = np.cumsum(starts)
-    index = np.flatnonzero(keep)
-    anew = np.ones(len(index), np.bool_)
-    anew[1:] = (chain[index[1:]] != chain[index[:-1]]) | (index[1:] != index[:-1] + 1)
-    return x[index], y[index], strength[index], sample[index], anew
+def _columns(pairs: Float64) -> tuple[Float32, Float32]:
+    """Both columns of (B, 2), contiguous, which makes looking them up for every point three times as fast."""
+    return np.ascontiguousarray(pairs[:, 0], np.float32), np.ascontiguousarray(pairs[:, 1], np.float32)

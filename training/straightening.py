@@ -49,7 +49,7 @@ class Straightening(nn.Module):
         self.register_buffer("legendre", _legendre_projection(), persistent=False)
 
     def forward(self, values: Tensor, features: Tensor) -> Tensor:
-        """values: (..., 48) node values; features: (..., FEATURES) of chains, whose first 2 SAMPLES are the chain's
+        """values: (..., 72) node values; features: (..., FEATURES) of chains, whose first 2 SAMPLES are the chain's
         points; leading shapes broadcast. Returns (..., FEEDBACK).
 
         Per chain, in reference pixels: the offsets of its straightened points across it; the second and third Legendre
@@ -72,7 +72,7 @@ class Straightening(nn.Module):
     def _target(self, guides: Tensor, along: Tensor, across: Tensor) -> Tensor:
         """Target coordinate of points: solves sum_k L_k(t) P_k(along) = across for t by Newton's method.
 
-        guides: (..., 24) node values of one direction's guides. along, across: (..., SAMPLES).
+        guides: (..., 36) node values of one direction's guides. along, across: (..., SAMPLES).
         """
         shape = guides.shape[:-1]
         coefficients = guides.reshape(*shape, len(ANCHORS), len(NODES)) @ self.by_node
@@ -82,12 +82,14 @@ class Straightening(nn.Module):
         for degree in range(len(NODES)):
             curves = [c + in_target[..., k, degree, None] * power for k, c in enumerate(curves)]
             power = power * along
-        a, b, c, d = curves
         target = across
         for _ in range(_NEWTON_STEPS):
-            slope = (b + target * (2 * c + 3 * d * target)).clamp(min=_SHALLOWEST_SLOPE)
-            miss = a + target * (b + target * (c + d * target)) - across
-            target = (target - (miss / slope).clamp(-0.6, 0.6)).clamp(-_FURTHEST, _FURTHEST)
+            value, slope = curves[-1], torch.zeros_like(across)
+            for curve in reversed(curves[:-1]):
+                slope = slope * target + value
+                value = value * target + curve
+            step = ((value - across) / slope.clamp(min=_SHALLOWEST_SLOPE)).clamp(-0.6, 0.6)
+            target = (target - step).clamp(-_FURTHEST, _FURTHEST)
         return target
 
     def _from_all_points(self, features: Tensor) -> Tensor:
