@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -47,6 +48,7 @@ async def serve(settings: Settings, on_ready: Callable[[Addresses], None] | None
     """
     stop = asyncio.Event()
     _handle_signals(stop)
+    http_socket = _bound_socket(settings.http_host, settings.http_port)
     service = build_service(settings)
     try:
         await service.start()
@@ -54,8 +56,6 @@ async def serve(settings: Settings, on_ready: Callable[[Addresses], None] | None
         http_server = _HttpServer(
             uvicorn.Config(
                 create_app(service, settings),
-                host=settings.http_host,
-                port=settings.http_port,
                 http="httptools",
                 ws="none",
                 lifespan="off",
@@ -65,10 +65,9 @@ async def serve(settings: Settings, on_ready: Callable[[Addresses], None] | None
                 timeout_graceful_shutdown=max(1, round(settings.drain_s)),
             )
         )
-        serving = asyncio.create_task(http_server.serve())
-        await _started(http_server, serving)
+        serving = asyncio.create_task(http_server.serve(sockets=[http_socket]))
         addresses = Addresses(
-            f"{settings.http_host}:{_bound_port(http_server)}",
+            f"{settings.http_host}:{http_socket.getsockname()[1]}",
             f"{settings.grpc_host}:{rpc_port}",
         )
         pool = service.pool.state()
@@ -89,6 +88,7 @@ async def serve(settings: Settings, on_ready: Callable[[Addresses], None] | None
         await asyncio.wait({serving, stopping}, return_when=asyncio.FIRST_COMPLETED)
         await _drain(service, settings, http_server, serving, rpc_server)
     finally:
+        http_socket.close()
         await service.close(0.0)
 
 
@@ -106,16 +106,14 @@ async def _drain(
     log.info("stopped", finished=finished)
 
 
-async def _started(server: uvicorn.Server, serving: asyncio.Task[None]) -> None:
-    while not server.started:
-        if serving.done():
-            await serving
-            raise OSError(f"HTTP cannot listen on {server.config.host}:{server.config.port}")
-        await asyncio.sleep(0.01)
-
-
-def _bound_port(server: uvicorn.Server) -> int:
-    return int(server.servers[0].sockets[0].getsockname()[1])
+def _bound_socket(host: str, port: int) -> socket.socket:
+    """A listening socket, so that a taken address is known before anything else is started."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family, backlog=2048)
+    except OSError as error:
+        reason = os.strerror(error.errno) if error.errno else str(error)
+        raise OSError(error.errno, f"HTTP cannot listen on {host}:{port}: {reason}") from error
 
 
 def _handle_signals(stop: asyncio.Event) -> None:

@@ -43,8 +43,8 @@ class Server:
             return bytes(answer.read())
 
     def workers(self) -> list[psutil.Process]:
-        """The render worker processes."""
-        pids = {worker["pid"] for worker in json.loads(self.get("/readyz"))["workers"]}
+        """The render worker processes, as the log names them."""
+        pids = {entry["pid"] for entry in self.lines if entry["event"] == "render worker ready"}
         return [child for child in psutil.Process(self.process.pid).children(recursive=True) if child.pid in pids]
 
 

@@ -4,6 +4,7 @@ import json
 import urllib.error
 import urllib.request
 import zlib
+from email.message import Message
 
 import cv2
 import numpy as np
@@ -17,10 +18,14 @@ def post(server: Server, path: str, body: bytes, method: str = "POST") -> tuple[
     request.add_header("Content-Type", "application/octet-stream")
     try:
         with urllib.request.urlopen(request, timeout=60) as answer:
-            return answer.status, dict(answer.headers), answer.read()
+            return answer.status, titled(answer.headers), answer.read()
     except urllib.error.HTTPError as error:
         with error:
-            return error.code, dict(error.headers), error.read()
+            return error.code, titled(error.headers), error.read()
+
+
+def titled(headers: Message) -> dict[str, str]:
+    return {name.title(): value for name, value in headers.items()}
 
 
 def facade(width: int = 640, height: int = 480, bend: float = 0.25) -> np.ndarray:

@@ -33,7 +33,8 @@ def test_sigterm_finishes_what_was_accepted_and_leaves_nothing_in_shared_memory(
     for call in calls:
         call.join()
     assert statuses == [200, 200, 200]
-    assert stop_server(server) == 0
+    assert server.process.wait(30) == 0
+    stop_server(server)
     assert set(os.listdir("/dev/shm")) <= before
 
 
