@@ -10,6 +10,8 @@ from unbend_service.domain.errors import InvalidGrid, InvalidInput, InvalidOptio
 from unbend_service.domain.grid import Grid
 from unbend_service.domain.guides import Guides
 
+_MAX_TEXT = 128
+
 
 class Correct(StrEnum):
     """What is corrected: the homography-free part only, or all of the estimated map."""
@@ -100,14 +102,28 @@ class GridRecord:
             return cls(
                 grid=Grid.from_dict(value["grid"]),
                 guides=None if guides is None else Guides.from_dict(guides),
-                confidence=float(value.get("confidence", 1.0)),
-                confidence_kind=str(value.get("confidence_kind", "given")),
+                confidence=_share(value, "confidence"),
+                confidence_kind=_text(value, "confidence_kind", "given"),
                 outcome=Outcome(value.get("outcome", "corrected")),
                 reason=Reason(value.get("reason", "")),
-                strength=float(value.get("strength", 1.0)),
-                model=str(value.get("model", "")),
+                strength=_share(value, "strength"),
+                model=_text(value, "model", ""),
             )
         except InvalidInput:
             raise
         except (TypeError, ValueError) as error:
             raise InvalidGrid("A field of the stored grid has the wrong type or value.") from error
+
+
+def _share(value: dict[str, Any], name: str) -> float:
+    share = value.get(name, 1.0)
+    if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share <= 1:
+        raise InvalidGrid(f"{name} of the stored grid is {share!r:.40}.", allowed="a number 0..1")
+    return float(share)
+
+
+def _text(value: dict[str, Any], name: str, default: str) -> str:
+    text = value.get(name, default)
+    if not isinstance(text, str) or len(text) > _MAX_TEXT:
+        raise InvalidGrid(f"{name} of the stored grid is not a short text.", allowed=f"at most {_MAX_TEXT} characters")
+    return text

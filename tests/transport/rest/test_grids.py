@@ -106,6 +106,35 @@ async def test_a_bad_grid_is_refused_and_named(client: httpx.AsyncClient, name: 
     assert (await client.post("/v1/grids", json={"grid": GRID.to_dict()})).status_code == 201
 
 
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("confidence", "nan"),
+        ("confidence", 1.5),
+        ("confidence", None),
+        ("strength", -1),
+        ("strength", True),
+        ("outcome", "maybe"),
+        ("reason", 7),
+        ("model", "x" * 200),
+        ("model", {"name": "first"}),
+        ("confidence_kind", 3),
+    ],
+)
+async def test_a_bad_provenance_is_refused(client: httpx.AsyncClient, field: str, value: object) -> None:
+    """What is said of a grid has types and ranges too; what is stored always fits the description of the answer."""
+    response = await client.post("/v1/grids", json={"grid": GRID.to_dict(), field: value})
+    assert (response.status_code, response.json()["code"]) == (422, "invalid_grid")
+
+
+async def test_texts_of_a_sender_do_not_break_headers(client: httpx.AsyncClient, jpeg: bytes) -> None:
+    """A model name with line breaks or foreign letters is stored, and shown printable in headers."""
+    stored = await client.post("/v1/grids", json={"grid": GRID.to_dict(), "model": "a\r\nSet-Cookie: x=ü"})
+    grid_id = stored.json()["grid_id"]
+    response = await client.post(f"/v1/correct?grid_id={grid_id}", content=jpeg)
+    assert response.headers["unbend-model"] == "a??Set-Cookie: x=?"
+
+
 async def test_a_nan_literal_is_explained(client: httpx.AsyncClient) -> None:
     """Python's json module writes NaN, which is not JSON; the answer says so."""
     response = await client.post("/v1/grids", content=with_source("NaN"))
