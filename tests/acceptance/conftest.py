@@ -71,11 +71,15 @@ def start_server(**settings: str) -> Server:
                 server.http, server.grpc = str(entry["http"]), str(entry["grpc"])
                 ready.set()
 
-    threading.Thread(target=read, daemon=True).start()
+    reader = threading.Thread(target=read, daemon=True)
+    reader.start()
     deadline = time.monotonic() + 60
     while not ready.wait(0.1):
         if process.poll() is not None or time.monotonic() > deadline:
             process.kill()
+            reader.join()
+            assert process.stderr is not None
+            process.stderr.close()
             raise AssertionError(f"the service did not start: {server.lines}")
     return server
 
