@@ -72,8 +72,13 @@ def _parser() -> argparse.ArgumentParser:
     export = verbs.add_parser("export", help="write a checkpoint as ONNX with its card, checked against torch")
     export.add_argument("--name", default="run-cooled")
     export.add_argument("--weights", type=Path, default=Path("service/unbend_service/models/lineset.onnx"))
-    export.add_argument("--calibration", type=Path, help="a calibration.json written by `evaluate --calibrate`")
+    export.add_argument("--calibration", type=Path, help="the .json that `calibrate` wrote")
     export.set_defaults(verb=_export)
+
+    calibrate = verbs.add_parser("calibrate", help="fit the confidence of a checkpoint on training photographs")
+    calibrate.add_argument("--name", default="run-cooled")
+    calibrate.add_argument("--limit", type=int, default=100, help="photographs per family")
+    calibrate.set_defaults(verb=_calibrate)
 
     evaluate = verbs.add_parser("evaluate", help="measure exported weights, or a checkpoint, on validation pictures")
     evaluate.add_argument("--weights", type=Path, help="an exported .onnx; otherwise --name's checkpoint is exported")
@@ -152,17 +157,36 @@ def _export(arguments: argparse.Namespace) -> None:
 
     confidence = UNCALIBRATED
     if arguments.calibration is not None:
-        confidence = tuple(json.loads(arguments.calibration.read_text())["confidence"])
+        confidence = tuple(json.loads(arguments.calibration.read_text())["weights"])
     checkpoint = Checkpoint.load(arguments.directory / f"{arguments.name}.pt")
     difference = export(checkpoint, arguments.weights, confidence=confidence)
     print(f"{arguments.weights}: {checkpoint.samples} samples, differs from torch by {difference:.1e}")
+
+
+def _calibrate(arguments: argparse.Namespace) -> None:
+    from dataclasses import asdict
+
+    from training.calibration import calibrate, gather, reliability_table
+    from training.checkpoints import Checkpoint
+    from training.export import export
+    from unbend_service.adapters.estimators.cards import read_card
+    from unbend_service.adapters.estimators.lineset import LinesetEstimator
+
+    directory: Path = arguments.directory / "evaluations"
+    weights = directory / f"{arguments.name}.onnx"
+    export(Checkpoint.load(arguments.directory / f"{arguments.name}.pt"), weights)
+    estimator = LinesetEstimator(read_card(str(weights)), arguments.threads)
+    calibration = calibrate(gather(estimator, arguments.photos, arguments.limit))
+    path = arguments.directory / f"{arguments.name}-calibration.json"
+    path.write_text(json.dumps(asdict(calibration), indent=2) + "\n")
+    print(f"{path}\n{reliability_table(calibration.reliability)}")
 
 
 def _evaluate(arguments: argparse.Namespace) -> None:
     from training.checkpoints import Checkpoint
     from training.evaluation import measure, measure_harm, table, write
     from training.export import export
-    from training.protocol import validation_photographs
+    from training.protocol import photographs
     from unbend_service.adapters.estimators.cards import read_card
     from unbend_service.adapters.estimators.lineset import LinesetEstimator
 
@@ -175,8 +199,8 @@ def _evaluate(arguments: argparse.Namespace) -> None:
         weights = directory / f"{arguments.name}.onnx"
         export(checkpoint, weights)
     estimator = LinesetEstimator(read_card(str(weights)), arguments.threads)
-    photographs = validation_photographs(arguments.photos, arguments.limit)
-    text = table(measure(estimator, photographs), measure_harm(estimator, photographs), arguments.threshold, title)
+    pictures = photographs(arguments.photos, "val", arguments.limit)
+    text = table(measure(estimator, pictures), measure_harm(estimator, pictures), arguments.threshold, title)
     write(text, directory / f"{weights.stem}-{arguments.limit}.md")
     print(text)
 

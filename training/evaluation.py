@@ -19,6 +19,7 @@ from training.distortions import DistortionBatch
 from training.protocol import FAMILIES, LZSL_SIX, Bytes, cases
 from unbend_service.adapters.estimators.lineset import Evidence, LinesetEstimator
 from unbend_service.domain.decision import spin_grid
+from unbend_service.domain.errors import InvalidGrid, InvalidGuides
 from unbend_service.domain.guides import Guides
 from unbend_service.domain.maps import BackwardMap, target_lattice
 from unbend_service.domain.records import Correct
@@ -44,17 +45,20 @@ class Measurement:
 
 
 def measure(
-    estimator: LinesetEstimator, photographs: list[Bytes], families: Iterable[str] = FAMILIES
+    estimator: LinesetEstimator, photographs: list[Bytes], families: Iterable[str] = FAMILIES, seed: int | None = None
 ) -> list[Measurement]:
-    """Every photograph under every family."""
+    """Every photograph under every family; see `protocol.cases` for the seed."""
     measurements = []
     for family in families:
-        for case in cases(family, photographs):
+        for case in cases(family, photographs, seed):
             guides, evidence = estimator.examine(case.picture)
-            confidence = estimator.estimate(case.picture).confidence
+            confidence = estimator.confidence(evidence)
             target, truth = true_correspondences(case.distortion)
             overall_nothing, nonlinear_nothing = map_errors(lambda points: points, target, truth)
-            overall, nonlinear = map_errors(guides, target, truth)
+            try:
+                overall, nonlinear = map_errors(guides, target, truth)
+            except InvalidGuides:  # the service leaves such a picture alone
+                overall, nonlinear, confidence = overall_nothing, nonlinear_nothing, 0.0
             measurements.append(
                 Measurement(family, overall_nothing, overall, nonlinear_nothing, nonlinear, evidence, confidence)
             )
@@ -132,7 +136,10 @@ def measure_harm(estimator: LinesetEstimator, photographs: list[Bytes]) -> Float
 def _displacement(guides: Guides, width: int, height: int) -> float:
     if guides.is_straight:
         return 0.0
-    grid = spin_grid(guides, Correct.NONLINEAR, 33)
+    try:
+        grid = spin_grid(guides, Correct.NONLINEAR, 33)
+    except (InvalidGuides, InvalidGrid):
+        return 0.0
     offset = (grid.source - target_lattice(33, 33)) * np.array([width, height]) / max(width, height)
     return float(np.hypot(offset[..., 0], offset[..., 1]).mean() * PIXELS)
 

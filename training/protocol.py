@@ -39,18 +39,19 @@ class Case:
     distortion: DistortionBatch
 
 
-def validation_photographs(folder: Path, limit: int) -> list[Bytes]:
-    """Colour photographs of the val split in the order of the public evaluation: sorted by the hash of their path."""
+def photographs(folder: Path, split: str, limit: int) -> list[Bytes]:
+    """Colour photographs of a split (val, train) in the order of the public evaluation: by the hash of their path."""
     with open(folder / "index.csv", newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["split"] == "val"]
+        rows = [row for row in csv.DictReader(file) if row["split"] == split]
     rows.sort(key=lambda row: hashlib.sha256(row["path"].encode()).hexdigest())
     return [np.asarray(cv2.imread(str(folder / row["path"])), np.uint8) for row in rows[:limit]]
 
 
-def cases(family: str, photographs: list[Bytes]) -> Iterator[Case]:
-    """Each photograph under a random distortion of the family; deterministic."""
-    generator = np.random.default_rng(sum(map(ord, family)))
-    for photograph in photographs:
+def cases(family: str, pictures: list[Bytes], seed: int | None = None) -> Iterator[Case]:
+    """Each photograph under a random distortion of the family; without a seed, those of the public evaluation."""
+    public = sum(map(ord, family))
+    generator = np.random.default_rng(public if seed is None else [public, seed])
+    for photograph in pictures:
         distortion = draw_family(family, generator)
         yield Case(distorted(_centre_square(photograph), distortion), distortion)
 

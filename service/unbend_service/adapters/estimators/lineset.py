@@ -107,15 +107,19 @@ class LinesetEstimator:
             InvalidGuides: the network's answer is no set of guides (never seen; a guard).
         """
         guides, evidence = self.examine(grey)
-        if evidence is None:
-            return Estimate(guides, 0.0, "calibrated_probability", self._model, None)
         return Estimate(
             guides=guides,
-            confidence=float(1 / (1 + np.exp(-np.clip(self._weights @ evidence.inputs(), -30, 30)))),
+            confidence=self.confidence(evidence),
             confidence_kind="calibrated_probability",
             model=self._model,
-            expected_error=evidence.expected_error / _PIXELS,
+            expected_error=None if evidence is None else evidence.expected_error / _PIXELS,
         )
+
+    def confidence(self, evidence: Evidence | None) -> float:
+        """Probability that a correction backed by this evidence makes the picture straighter; 0 without evidence."""
+        if evidence is None:
+            return 0.0
+        return float(1 / (1 + np.exp(-np.clip(self._weights @ evidence.inputs(), -30, 30))))
 
     def examine(self, grey: Bytes) -> tuple[Guides, Evidence | None]:
         """The guides of a (height, width) uint8 picture and what speaks for them; straight guides and None where

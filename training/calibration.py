@@ -1,0 +1,76 @@
+"""The confidence: a logistic regression that turns what speaks for an estimate into the probability that the picture,
+its nonlinear part corrected, is nearer to straight than it was.
+
+Fitted on training photographs under fresh distortions, so that the validation photographs remain to check it on.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from training.evaluation import Measurement, measure
+from training.protocol import photographs
+from unbend_service.adapters.estimators.lineset import LinesetEstimator
+
+Float64 = npt.NDArray[np.float64]
+
+FAMILIES = ("none", "rotation", "projective", "barrel", "pincushion", "wave", "mixed", "brown", "fisheye")
+SEED = 20
+_RIDGE = 1e-2
+_BINS = np.array([0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.98, 1.0])
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """weights: of `Evidence.inputs`. reliability: rows of (predicted, observed, pictures)."""
+
+    weights: tuple[float, ...]
+    reliability: list[tuple[float, float, int]]
+
+
+def gather(estimator: LinesetEstimator, folder: Path, limit: int) -> list[Measurement]:
+    """Measurements on training photographs."""
+    return measure(estimator, photographs(folder, "train", limit), FAMILIES, seed=SEED)
+
+
+def calibrate(measurements: list[Measurement]) -> Calibration:
+    """Fits the weights by Newton's method on the penalised likelihood."""
+    known = [m for m in measurements if m.evidence is not None]
+    inputs = np.array([m.evidence.inputs() for m in known if m.evidence is not None])
+    better = np.array([m.nonlinear < m.nonlinear_nothing for m in known], np.float64)
+    weights = np.zeros(inputs.shape[1])
+    for _ in range(50):
+        probability = probabilities(inputs, weights)
+        gradient = inputs.T @ (probability - better) + _RIDGE * weights
+        curvature = (inputs * (probability * (1 - probability))[:, None]).T @ inputs + _RIDGE * np.eye(len(weights))
+        step = np.linalg.solve(curvature, gradient)
+        weights = weights - step
+        if np.abs(step).max() < 1e-8:
+            break
+    return Calibration(tuple(weights.tolist()), reliability(probabilities(inputs, weights), better))
+
+
+def probabilities(inputs: Float64, weights: Float64) -> Float64:
+    """(n,) of inputs (n, k)."""
+    return np.asarray(1 / (1 + np.exp(-np.clip(inputs @ weights, -30, 30))))
+
+
+def reliability(predicted: Float64, better: Float64) -> list[tuple[float, float, int]]:
+    """Mean predicted probability, observed share and number of pictures of each bin that is not empty."""
+    rows = []
+    for low, high in itertools.pairwise(_BINS):
+        inside = (predicted >= low) & ((predicted < high) | (high == 1.0))
+        if inside.any():
+            rows.append((float(predicted[inside].mean()), float(better[inside].mean()), int(inside.sum())))
+    return rows
+
+
+def reliability_table(rows: list[tuple[float, float, int]]) -> str:
+    """Markdown."""
+    lines = ["| confidence | better in | pictures |", "|---|---|---|"]
+    return "\n".join(lines + [f"| {predicted:.2f} | {observed:.2f} | {count} |" for predicted, observed, count in rows])
