@@ -104,6 +104,9 @@ class AsyncStream:
                         exhausted = True
                         if self._core.is_waiting and self._core.grid is None:
                             self._finish()  # so that the grid is not waited for: no further frames come for it
+            if self._finishing and self._connection is not None:
+                await asyncio.to_thread(self._connection.join)
+                await self._disconnect()
         finally:
             for task in (pulling, taking):
                 if task is not None:

@@ -103,6 +103,9 @@ class Stream:
             self._finish()  # so that the grid is not waited for: there are no further frames for it
         while self._core.is_waiting:
             yield from self._results()
+        if self._finishing and self._connection is not None:
+            self._connection.join()
+            self._disconnect()
 
     def close(self) -> None:
         """Ends the stream; frames that are not answered are given up. The server remembers the grid."""

@@ -6,57 +6,12 @@ from dataclasses import dataclass
 import grpc
 import pytest
 
-from tests.fakes import FAKE_MODEL, FakeEstimator, FakeRenderPool, RecordingMeter
+from tests.assembly import service_over_fakes
+from tests.fakes import FakeRenderPool, RecordingMeter
 from unbend.v1 import correction_pb2_grpc, estimation_pb2_grpc, grid_pb2_grpc
-from unbend_service.adapters.codecs.pillow import PillowCodec
-from unbend_service.adapters.drawing.overlay import OverlayIllustrator
-from unbend_service.adapters.grid_stores.memory import MemoryGridStore
-from unbend_service.application.blocking import BlockingWork
-from unbend_service.application.correction import Correction
-from unbend_service.application.estimation import Estimation
-from unbend_service.application.fitting import FittedGrids
-from unbend_service.application.grids import GridLibrary
-from unbend_service.application.illustration import Illustration
 from unbend_service.application.service import Service
-from unbend_service.application.streams import Streams
 from unbend_service.settings import Settings
 from unbend_service.transport.rpc.server import start_server
-
-
-def service_over_fakes(settings: Settings) -> Service:
-    """Real use cases, codec and grid store over fakes of the estimator and the pool."""
-    meter, estimator, pool = RecordingMeter(), FakeEstimator(), FakeRenderPool()
-    blocking = BlockingWork(2, settings.queue_frames, meter)
-    codec, store = PillowCodec(settings), MemoryGridStore(settings)
-    grids = FittedGrids(blocking, meter)
-    estimation = Estimation(
-        estimator,
-        codec,
-        store,
-        grids,
-        blocking,
-        meter,
-        grid_points=settings.grid_points,
-        min_confidence=settings.min_confidence,
-    )
-    correction = Correction(
-        estimation, codec, store, grids, pool, blocking, meter, jpeg_quality=92, deadline_s=settings.render_deadline_s
-    )
-    streams = Streams(estimation, correction, store, codec, blocking, meter, settings)
-    library = GridLibrary(store, grid_points=settings.grid_points)
-    return Service(
-        estimation=estimation,
-        correction=correction,
-        illustration=Illustration(estimation, codec, store, OverlayIllustrator(), blocking, jpeg_quality=92),
-        grids=library,
-        streams=streams,
-        pool=pool,
-        store=store,
-        codec=codec,
-        meter=meter,
-        blocking=blocking,
-        model=FAKE_MODEL,
-    )
 
 
 @dataclass

@@ -63,21 +63,23 @@ class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg] # g
         )
 
     async def _watched(self, name: str, request_id: str, context: Context, work: Awaitable[Any]) -> Any:
-        start, code = time.perf_counter(), grpc.StatusCode.OK
+        start = time.perf_counter()
+
+        def count(code: grpc.StatusCode) -> None:  # before the client knows, so that it sees its call counted
+            self._service.meter.request("grpc", name, code.name, time.perf_counter() - start)
+
         try:
             with structlog.contextvars.bound_contextvars(request_id=request_id, method=name):
                 result, status = await self._outcome(name, work)
-            if status is None:
-                context.set_trailing_metadata(((_REQUEST_ID, request_id),))
-                return result
-            code = status.code
-            metadata = (*status.trailing_metadata, (_REQUEST_ID, request_id))
-            await context.abort(status.code, status.message, metadata)
         except asyncio.CancelledError:
-            code = grpc.StatusCode.CANCELLED
+            count(grpc.StatusCode.CANCELLED)
             raise
-        finally:
-            self._service.meter.request("grpc", name, code.name, time.perf_counter() - start)
+        if status is None:
+            count(grpc.StatusCode.OK)
+            context.set_trailing_metadata(((_REQUEST_ID, request_id),))
+            return result
+        count(status.code)
+        return await context.abort(status.code, status.message, (*status.trailing_metadata, (_REQUEST_ID, request_id)))
 
     async def _outcome(self, name: str, work: Awaitable[Any]) -> tuple[Any, Status | None]:
         """What a call returned, or the status that it ends with."""
