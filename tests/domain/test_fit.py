@@ -94,6 +94,14 @@ def test_crop_shows_no_gap_on_small_lattices(true: BackwardMap, shape: tuple[int
     assert np.abs(cropped(uniform(101))).max() <= 1 + 1e-12
 
 
+def test_crop_shows_no_gap_between_the_points_of_its_search() -> None:
+    """A ripple finer than the search looks at does not slip through: every point of a fine lattice is asked."""
+    turn = rotation(5)
+    ripple: BackwardMap = lambda target: turn(target) + 0.001 * np.sin(128 * np.pi * target)  # noqa: E731 - as above
+    cropped = with_fit(Grid.from_map(ripple, 513, 513), CROP)
+    assert np.abs(cropped.source).max() <= 1
+
+
 @pytest.mark.parametrize("degrees", [0.5, 5, -15, 30, 45])
 def test_the_crop_of_a_rotation_is_the_largest(degrees: float) -> None:
     """A square turned by a holds an upright one of 1 / (cos a + sin a) of its size; the crop is that, within 1e-3."""

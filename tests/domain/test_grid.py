@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from tests.domain.lenses import BARREL, error_px, radial, rotation, shear, wave
+from tests.domain.lenses import BARREL, PINCUSHION, error_px, radial, rotation, shear, wave
 from unbend_service.domain.errors import FoldedGrid, InvalidGrid
+from unbend_service.domain.fitting import guides_from_map
 from unbend_service.domain.grid import MAX_POINTS, MAX_SOURCE, Float32, Grid, folded_share
 from unbend_service.domain.maps import BackwardMap, Float64, target_lattice
 
@@ -80,6 +81,15 @@ def test_the_continuation_follows_a_lens(strength: float) -> None:
     target = np.stack([np.linspace(-0.5, 0.5, 9), np.full(9, sides)], axis=-1)
     error = Grid.from_map(true)(target) - true(target)
     assert np.hypot(*error.T).max() < 1 * 2 / 256
+
+
+@pytest.mark.parametrize("strength", [0.25, 0.3, PINCUSHION])
+def test_nothing_comes_back_into_sight(strength: float) -> None:
+    """Outside the frame of a strong pincushion, all of whose picture is in the frame, there is nothing to be seen."""
+    grid = Grid.from_map(guides_from_map(radial(strength), points=25, polish=0))
+    plane = target_lattice(129, 129, 2.0).reshape(-1, 2)
+    outside = np.abs(plane).max(axis=1) > 1
+    assert (np.abs(grid(plane[outside])) > 1).any(axis=1).all()
 
 
 @given(lattices(3.0), st.floats(-8, 8), st.floats(-8, 8))

@@ -76,6 +76,28 @@ def test_any_guides_give_finite_points_or_a_typed_error(rows: Float64, columns: 
     assert np.abs(source).max() <= MAX_REACH * (1 + 1e-12)
 
 
+def test_the_other_side_of_a_fold_is_not_shown() -> None:
+    """Where two guides cross twice only the first crossing counts: in sight the curves cross, they never touch."""
+    shown = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        guides = bent(*rng.normal(0, 0.3, (2, 4, 4)))
+        lattice = target_lattice(33, 33).reshape(-1, 2)
+        try:
+            source = guides(lattice)
+        except InvalidGuides:
+            continue
+        visible = (np.abs(source) <= 1).all(axis=1)
+        slopes = []
+        for family, across, along in ((guides.rows, 1, 0), (guides.columns, 0, 1)):
+            curves = family.at(lattice[visible, across])
+            powers = np.vander(source[visible, along], 3, increasing=True)
+            slopes.append((curves[:, 1:] * [1, 2, 3] * powers).sum(axis=1))
+        assert (1 - slopes[0] * slopes[1] > 0).all()
+        shown += int(visible.sum())
+    assert shown > 1000
+
+
 def test_guides_that_never_meet_are_refused() -> None:
     """Rows and columns that run side by side are no grid."""
     rows = np.zeros((4, 4))
