@@ -125,10 +125,12 @@ class CorrectRequest(_message.Message):
     min_confidence: _builtins.float
     """Below this confidence, 0..1, the picture is left alone; absent means the server's setting."""
     answer_format: _frame_pb2.PixelFormat.ValueType
-    """Layout of the answer if an encoded picture is to come back in another encoded format; unspecified: the same."""
+    """Layout of the answer if an encoded picture is to come back in another encoded format; unspecified: that of format."""
     @_builtins.property
     def format(self) -> _frame_pb2.FrameFormat:
-        """How data is laid out; the answer has the same layout."""
+        """How data is laid out; the answer has the same layout. Of an encoded picture it says only how the answer is to be
+        encoded: data may be any file that the service reads.
+        """
 
     @_builtins.property
     def rendering(self) -> _frame_pb2.Rendering:
@@ -243,7 +245,7 @@ class StreamOpen(_message.Message):
     same grid, no new estimate. Empty: the server chooses one and says it in opened.
     """
     correct: _grid_pb2.Correct.ValueType
-    """What an estimate corrects."""
+    """What an estimate corrects; ignored with a grid_id or guides."""
     grid_id: _builtins.str
     """A stored grid."""
     while_estimating: Global___WhileEstimating.ValueType
@@ -256,7 +258,7 @@ class StreamOpen(_message.Message):
     """Estimate anew although the stream id has a grid."""
     @_builtins.property
     def format(self) -> _frame_pb2.FrameFormat:
-        """Layout of every frame; results have the same."""
+        """Layout of every frame; results have the same. A frame that is not of it fails; the stream goes on."""
 
     @_builtins.property
     def rendering(self) -> _frame_pb2.Rendering:
@@ -264,7 +266,7 @@ class StreamOpen(_message.Message):
 
     @_builtins.property
     def estimate(self) -> Global___EstimateFrames:
-        """An estimate over the first frames; the default."""
+        """An estimate over the first frames; the default. A stream id that has a grid keeps it."""
 
     @_builtins.property
     def guides(self) -> _grid_pb2.Guides:
@@ -308,7 +310,10 @@ class EstimateFrames(_message.Message):
 
     FRAMES_FIELD_NUMBER: _builtins.int
     frames: _builtins.int
-    """1..64 frames whose estimates are combined robustly; 0 means the server's setting."""
+    """1..64 frames whose estimates are combined robustly; 0 means the server's setting. Fewer are taken when the stream
+    ends, when all frames that may be in flight wait, or when no further frame comes for a while. Frames that cannot be
+    decoded do not count.
+    """
     def __init__(
         self,
         *,
@@ -332,7 +337,7 @@ class StreamFrame(_message.Message):
     TIMESTAMP_US_FIELD_NUMBER: _builtins.int
     DATA_FIELD_NUMBER: _builtins.int
     index: _builtins.int
-    """Chosen by the client, strictly increasing within a stream; comes back with the result."""
+    """Chosen by the client, strictly increasing within a connection; comes back with the result."""
     timestamp_us: _builtins.int
     """Presentation time in microseconds, any origin; comes back with the result."""
     data: _builtins.bytes
@@ -367,7 +372,7 @@ class CorrectStreamResponse(_message.Message):
 
     @_builtins.property
     def grid(self) -> Global___StreamGrid:
-        """Once the grid is fixed, before the first result that uses it."""
+        """Once, when the grid is fixed, before the first result that uses it."""
 
     @_builtins.property
     def result(self) -> Global___StreamResult:

@@ -61,7 +61,9 @@ class CorrectionServiceServicer:
     def CorrectStream(self, request_iterator, context):
         """Straightens the frames of a stream. The client sends one open, then frames; the server sends one opened, the grid
         once it is fixed, and one result for each frame, in the order of the frames, each exactly once. Half-closing ends
-        the stream after the last result.
+        the stream after the last result. A stream id has one connection: opening it again ends the older one with ABORTED
+        (stream_taken_over), as does silence on both sides (stream_idle). A server that shuts down answers the frames it
+        has read and ends with UNAVAILABLE (draining): open the stream elsewhere and send again what was not answered.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

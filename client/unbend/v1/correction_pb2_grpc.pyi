@@ -38,7 +38,9 @@ class CorrectionServiceStub:
     CorrectStream: _grpc.StreamStreamMultiCallable[_correction_pb2.CorrectStreamRequest, _correction_pb2.CorrectStreamResponse]
     """Straightens the frames of a stream. The client sends one open, then frames; the server sends one opened, the grid
     once it is fixed, and one result for each frame, in the order of the frames, each exactly once. Half-closing ends
-    the stream after the last result.
+    the stream after the last result. A stream id has one connection: opening it again ends the older one with ABORTED
+    (stream_taken_over), as does silence on both sides (stream_idle). A server that shuts down answers the frames it
+    has read and ends with UNAVAILABLE (draining): open the stream elsewhere and send again what was not answered.
     """
 
 @_typing.type_check_only
@@ -51,7 +53,9 @@ class CorrectionServiceAsyncStub(CorrectionServiceStub):
     CorrectStream: _aio.StreamStreamMultiCallable[_correction_pb2.CorrectStreamRequest, _correction_pb2.CorrectStreamResponse]  # type: ignore[assignment]
     """Straightens the frames of a stream. The client sends one open, then frames; the server sends one opened, the grid
     once it is fixed, and one result for each frame, in the order of the frames, each exactly once. Half-closing ends
-    the stream after the last result.
+    the stream after the last result. A stream id has one connection: opening it again ends the older one with ABORTED
+    (stream_taken_over), as does silence on both sides (stream_idle). A server that shuts down answers the frames it
+    has read and ends with UNAVAILABLE (draining): open the stream elsewhere and send again what was not answered.
     """
 
 class CorrectionServiceServicer(metaclass=_abc_1.ABCMeta):
@@ -73,7 +77,9 @@ class CorrectionServiceServicer(metaclass=_abc_1.ABCMeta):
     ) -> _typing.Union[_abc.Iterator[_correction_pb2.CorrectStreamResponse], _abc.AsyncIterator[_correction_pb2.CorrectStreamResponse]]:
         """Straightens the frames of a stream. The client sends one open, then frames; the server sends one opened, the grid
         once it is fixed, and one result for each frame, in the order of the frames, each exactly once. Half-closing ends
-        the stream after the last result.
+        the stream after the last result. A stream id has one connection: opening it again ends the older one with ABORTED
+        (stream_taken_over), as does silence on both sides (stream_idle). A server that shuts down answers the frames it
+        has read and ends with UNAVAILABLE (draining): open the stream elsewhere and send again what was not answered.
         """
 
 def add_CorrectionServiceServicer_to_server(servicer: CorrectionServiceServicer, server: _typing.Union[_grpc.Server, _aio.Server]) -> None: ...

@@ -47,7 +47,14 @@ class _PixelFormatEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_PixelForm
     """A WebP file."""
 
 class PixelFormat(_PixelFormat, metaclass=_PixelFormatEnumTypeWrapper):
-    """How the bytes of a picture are laid out. Raw formats: rows from top to bottom, no padding, planes one after the
+    """Errors. A call that fails carries google.rpc.Status in grpc-status-details-bin, with google.rpc.ErrorInfo (domain
+    "unbend", reason the code of the error in capitals, metadata "allowed" and "setting" where they can be said) and, where
+    trying again later helps, google.rpc.RetryInfo. The same stands in plain trailing metadata: unbend-error-code,
+    unbend-error-message, unbend-error-allowed, unbend-error-setting (percent-encoded UTF-8) and
+    unbend-error-retry-after-s. Every answer carries x-request-id in its trailing metadata, the one that the call came
+    with or a new one.
+
+    How the bytes of a picture are laid out. Raw formats: rows from top to bottom, no padding, planes one after the
     other; chroma of i420 and nv12 at half resolution, rounded up for odd sizes.
     """
 
