@@ -14,7 +14,7 @@ from unbend_service.domain.errors import RendererUnavailable
 from unbend_service.domain.frames import Border, Frame
 from unbend_service.domain.grid import Grid
 
-DRAW, SLEEP, DIE, DIE_ONCE, HANG, RAISE, WHO, HANG_ONCE = range(8)
+DRAW, SLEEP, CRASH, KILLED_TWICE, KILLED, HANG, RAISE, WHO = range(8)
 SLEEP_S = 0.5
 
 
@@ -33,9 +33,11 @@ class MisbehavingRenderer:
         self._renderer.render(source, grid, border, target)
         if order == SLEEP:
             time.sleep(SLEEP_S)
-        elif order == DIE or (order == DIE_ONCE and first_time()):
+        elif order == CRASH:
+            os._exit(70)
+        elif order == KILLED or (order == KILLED_TWICE and times_before() < 2):
             os.kill(os.getpid(), signal.SIGKILL)
-        elif order == HANG or (order == HANG_ONCE and first_time()):
+        elif order == HANG:
             time.sleep(3600)
         elif order == RAISE:
             raise ValueError("a renderer that fails")
@@ -47,13 +49,12 @@ class MisbehavingRenderer:
         self._renderer.close()
 
 
-def first_time() -> bool:
-    """Whether no worker of this test came here before."""
-    try:
-        Path(os.environ["UNBEND_TEST_MARK"]).touch(exist_ok=False)
-    except FileExistsError:
-        return False
-    return True
+def times_before() -> int:
+    """How often workers of this test came here before."""
+    with Path(os.environ["UNBEND_TEST_MARK"]).open("a") as mark:
+        before = mark.tell()
+        mark.write("x")
+    return before
 
 
 def open_misbehaving(options: RendererOptions) -> MisbehavingRenderer:
@@ -69,6 +70,6 @@ def die_at_start(options: RendererOptions) -> MisbehavingRenderer:
 
 
 def die_at_restart(options: RendererOptions) -> MisbehavingRenderer:
-    if not first_time():
+    if times_before():
         os._exit(3)
     return MisbehavingRenderer()

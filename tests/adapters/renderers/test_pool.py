@@ -81,25 +81,29 @@ async def test_a_killed_worker_loses_no_frame(make_pool: MakePool, meter: Record
     assert meter.restarts["died"] == 2
 
 
-async def test_a_frame_is_rendered_again_when_its_worker_dies(make_pool: MakePool, meter: RecordingMeter) -> None:
-    """The caller notices nothing of a worker that died while it rendered the caller's frame."""
+async def test_a_frame_is_rendered_again_when_its_worker_is_killed(make_pool: MakePool, meter: RecordingMeter) -> None:
+    """The caller notices nothing of workers that were killed while they had the frame, not even of two."""
     pool = await make_pool()
-    source = frame(misbehaving.DIE_ONCE)
+    source = frame(misbehaving.KILLED_TWICE)
     np.testing.assert_array_equal(await pool.render(source, GRID, BLACK), expected(source))
-    assert meter.restarts == {"died": 1}
-    assert pool.state().workers[0].restarts == 1
+    assert meter.restarts == {"died": 2}
+    assert pool.state().workers[0].restarts == 2
 
 
-async def test_a_frame_that_kills_two_workers_is_given_up(make_pool: MakePool, meter: RecordingMeter) -> None:
+@pytest.mark.parametrize(("order", "deaths"), [(misbehaving.CRASH, 2), (misbehaving.KILLED, 4)])
+async def test_a_frame_in_which_workers_die_is_given_up(
+    make_pool: MakePool, meter: RecordingMeter, order: int, deaths: int
+) -> None:
     """A poisonous frame is answered with PoisonFrame; those behind it in the same worker are not blamed."""
     pool = await make_pool(slots_per_worker=3)
-    poison = asyncio.create_task(pool.render(frame(misbehaving.DIE), GRID, BLACK))
+    await pool.render(frame(misbehaving.DRAW), GRID, BLACK)
+    poison = asyncio.create_task(pool.render(frame(order), GRID, BLACK))
     behind = [asyncio.create_task(pool.render(frame(misbehaving.DRAW, n), GRID, BLACK)) for n in range(4)]
     with pytest.raises(PoisonFrame):
         await poison
     for n, answer in enumerate(behind):
         np.testing.assert_array_equal(await answer, expected(frame(misbehaving.DRAW, n)))
-    assert meter.restarts == {"died": 2}
+    assert meter.restarts == {"died": deaths}
 
 
 async def test_an_affinity_keeps_to_one_worker_while_that_is_free(make_pool: MakePool) -> None:
@@ -234,19 +238,19 @@ async def test_a_pool_without_a_renderer_does_not_start(make_pool: MakePool) -> 
 
 async def test_workers_that_die_at_start_are_not_tried_forever(make_pool: MakePool) -> None:
     """start gives up after a few deaths."""
-    with pytest.raises(RendererUnavailable, match="die at start"):
+    with pytest.raises(RendererUnavailable, match="die at start: exit status 3"):
         await make_pool("die_at_start")
 
 
 async def test_a_storm_of_deaths_makes_the_pool_unready(make_pool: MakePool, meter: RecordingMeter) -> None:
     """When no worker can be had any more, state says so and why, and callers are told instead of waiting."""
     pool = await make_pool("die_at_restart")
-    waiting = asyncio.create_task(pool.render(frame(misbehaving.DIE), GRID, BLACK))
+    waiting = asyncio.create_task(pool.render(frame(misbehaving.CRASH), GRID, BLACK))
     with pytest.raises(RendererUnavailable, match="died at start"):
         await waiting
     state = pool.state()
     assert not state.ready
-    assert "died at start" in state.reason
+    assert "died at start: exit status 3" in state.reason
     with pytest.raises(RendererUnavailable):
         await pool.render(frame(misbehaving.DRAW), GRID, BLACK)
     assert meter.restarts["start_failed"] >= 2

@@ -25,7 +25,7 @@ class Job:
         answer: what the caller waits for; done early when the caller has gone.
         slot: shared memory, from the first assignment to the answer.
         copied: whether the source is in the slot.
-        deaths: workers that died while they rendered this very frame.
+        blame: grows with every worker that dies while it renders this very frame.
         passed_over: how often a later frame was taken first because it suited the worker.
     """
 
@@ -38,7 +38,7 @@ class Job:
     answer: asyncio.Future[Bytes]
     slot: Slot | None = None
     copied: bool = False
-    deaths: int = 0
+    blame: int = 0
     passed_over: int = 0
 
     @property

@@ -34,6 +34,8 @@ log = structlog.get_logger(__name__)
 DEFAULT_FACTORY = "unbend_service.adapters.renderers.selection:open_renderer"
 #: A GPU gains little from more processes than keep it fed, and each holds a context and textures of its own.
 _WORKERS_OF_A_GPU = 4
+#: Two crashes make a frame poison. A SIGKILL comes from outside and says less of the frame, unless it comes every time.
+_BLAME_OF_A_CRASH, _BLAME_OF_A_KILL, _BLAME_OF_POISON = 2, 1, 4
 _METER_INTERVAL_S = 0.1
 
 
@@ -212,14 +214,14 @@ class WorkerPool:
             _settle(job, answer.error)
             self._finish(job)
 
-    def on_death(self, worker: WorkerProcess) -> None:
+    def on_death(self, worker: WorkerProcess, killed: bool) -> None:
         """A worker is gone: the frame it rendered is blamed, and all it held wait again, first in the queue."""
         culprit = worker.sent[0] if worker.sent else None
         for job in sorted(worker.held, key=lambda job: job.number, reverse=True):
             if job is culprit:
-                job.deaths += 1
-            if job.deaths > 1:
-                _settle(job, PoisonFrame("Two workers died while they rendered this frame."))
+                job.blame += _BLAME_OF_A_KILL if killed else _BLAME_OF_A_CRASH
+            if job.blame >= _BLAME_OF_POISON:
+                _settle(job, PoisonFrame("Worker after worker died while it rendered this frame."))
             if not job.copied:
                 continue  # the copy is under way, and what follows it sees that the worker is gone
             if job.answer.done():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import signal
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol
@@ -19,11 +20,13 @@ from unbend_service.domain.errors import RendererUnavailable
 log = structlog.get_logger(__name__)
 
 _START_TIMEOUT_S = 60.0
-#: A worker that lived so long, or rendered anything, was in order: its successor starts at once.
+#: A worker that lived so long, or was given a frame, was in order: its successor starts at once.
 _SOUND_LIFE_S = 2.0
 _FAILURES_TO_GIVE_UP = 3
 _LONGEST_BACKOFF_S = 30.0
 _LAST_WORDS_S = 2.0
+#: The channel of a dying process closes a moment before its exit status is there.
+_LAST_BREATH_S = 0.05
 
 
 class Listener(Protocol):
@@ -31,7 +34,9 @@ class Listener(Protocol):
 
     def on_answer(self, worker: WorkerProcess, answer: Done | Failed) -> None: ...
 
-    def on_death(self, worker: WorkerProcess) -> None: ...
+    def on_death(self, worker: WorkerProcess, killed: bool) -> None:
+        """``killed``: from outside or for lack of memory, not by a fault of its own."""
+        ...
 
     def on_restart(self, reason: str) -> None: ...
 
@@ -203,6 +208,7 @@ class Supervisor:
             if isinstance(message, Ready):
                 self._on_ready(place, worker, message.info)
             elif isinstance(message, Failed) and message.task is None:
+                worker.refused = True
                 self._on_refusal(message)
             else:
                 self._listener.on_answer(worker, message)
@@ -236,23 +242,31 @@ class Supervisor:
     def _bury(self, place: _Place, worker: WorkerProcess) -> None:
         place.worker = None
         place.stop_timer()
+        status = worker.exit_status(_LAST_BREATH_S)
         worker.kill()
         self._release(worker)
         ready = worker.info is not None
         reason = place.verdict or ("died" if ready else "start_failed")
         lived_s = asyncio.get_running_loop().time() - worker.started_s
-        if ready and (worker.rendered or lived_s > _SOUND_LIFE_S):
+        if ready and (worker.rendered or worker.sent or lived_s > _SOUND_LIFE_S):
             place.failures = -1
-        log.warning("render worker gone", worker=place.index, pid=worker.pid, reason=reason, frames=len(worker.held))
-        self._listener.on_death(worker)
+        elif not worker.refused:
+            self._last_error = f"exit status {status}" if reason == "start_failed" else reason
+        log.warning(
+            "render worker gone",
+            worker=place.index,
+            pid=worker.pid,
+            reason=reason,
+            exit_status=status,
+            frames=len(worker.held),
+        )
+        self._listener.on_death(worker, killed=status == -signal.SIGKILL)
         self._retry(place, reason)
 
     def _retry(self, place: _Place, reason: str) -> None:
         place.failures += 1
         if self._first is not None and not self._first.done() and place.failures >= _FAILURES_TO_GIVE_UP:
-            self._first.set_exception(
-                RendererUnavailable(f"Render workers die at start: {self._last_error or reason}.")
-            )
+            self._first.set_exception(RendererUnavailable(f"Render workers die at start: {self._last_error}."))
         if self._closed or (self._first is not None and self._first.done() and self._first.exception() is not None):
             return
         if self.broken:

@@ -28,6 +28,7 @@ class WorkerProcess:
     Attributes:
         index: place in the pool; the process that replaces a dead one has the same.
         info: its renderer, None until it is ready.
+        refused: whether it said why it can have no renderer.
         held: jobs that were assigned to it.
         sent: jobs that it knows of, in its order of work; the first is the one it renders.
         rendered: frames it has answered.
@@ -37,6 +38,7 @@ class WorkerProcess:
     def __init__(self, index: int, factory: str, options: RendererOptions, started_s: float) -> None:
         self.index = index
         self.info: RendererInfo | None = None
+        self.refused = False
         self.held: set[Job] = set()
         self.sent: deque[Job] = deque()
         self.rendered = 0
@@ -116,6 +118,13 @@ class WorkerProcess:
     def kill(self) -> None:
         """Ends the process at once, whatever it does."""
         self._process.kill()
+
+    def exit_status(self, patience_s: float) -> int | None:
+        """How the process ended, -N for signal N; None if it has not within ``patience_s``; blocking."""
+        try:
+            return self._process.wait(patience_s)
+        except subprocess.TimeoutExpired:
+            return None
 
     def reap(self, patience_s: float) -> int:
         """Waits for the process to end, kills it after ``patience_s``; blocking. Returns its exit status."""
