@@ -1,7 +1,7 @@
 """The client of Unbend, which straightens photographs and video from unknown cameras.
 
 >>> import numpy as np, unbend
->>> with unbend.Client("127.0.0.1:50051") as client:  # doctest: +SKIP
+>>> with unbend.Client("127.0.0.1:50051") as client:
 ...     corrected = client.correct(np.zeros((480, 640, 3), np.uint8)).image
 
 Needs numpy, grpcio and protobuf, which are loaded when the first name is used.

@@ -30,6 +30,8 @@ class AsyncClient:
     >>> async def straighten(image):
     ...     async with unbend.AsyncClient("127.0.0.1:50051") as client:
     ...         return (await client.correct(image)).image
+    >>> asyncio.run(straighten(np.zeros((48, 64, 3), np.uint8))).shape
+    (48, 64, 3)
     """
 
     def __init__(
