@@ -1,4 +1,4 @@
-"""`python -m training VERB`: store, train, cooldown, plot, export, evaluate, smoke."""
+"""`python -m training VERB`: store, train, cooldown, calibrate, export, evaluate, plot."""
 
 from __future__ import annotations
 
@@ -7,8 +7,13 @@ import json
 import os
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from training.loop import Recipe
 
 DEFAULT_DIRECTORY = Path.home() / ".cache" / "unbend" / "training"
 DEFAULT_PHOTOS = Path("../shared/photos")
@@ -61,7 +66,8 @@ def _parser() -> argparse.ArgumentParser:
 
     cooldown = verbs.add_parser("cooldown", help="bring a copy of the run to rest; the run itself stays as it is")
     cooldown.add_argument("--name", default="run")
-    cooldown.add_argument("--minutes", type=float, default=15)
+    cooldown.add_argument("--minutes", type=float, default=30)
+    cooldown.add_argument("--learning-rate", type=float, help="to begin with")
     cooldown.add_argument("--steps", type=int)
     cooldown.set_defaults(verb=_cooldown)
 
@@ -114,9 +120,8 @@ def _train(arguments: argparse.Namespace) -> None:
         checkpoint = Checkpoint.load(path)
     else:
         checkpoint = new_checkpoint(sampler, default_shape(), arguments.seed, arguments.inherit)
-    recipe = Recipe() if arguments.learning_rate is None else Recipe(learning_rate=arguments.learning_rate)
     train(
-        Run(checkpoint, recipe),
+        Run(checkpoint, _recipe(arguments, Recipe().warmup_steps)),
         sampler,
         directory,
         name=arguments.name,
@@ -128,11 +133,12 @@ def _train(arguments: argparse.Namespace) -> None:
 def _cooldown(arguments: argparse.Namespace) -> None:
     from training.chain_store import ChainStore
     from training.checkpoints import Checkpoint
-    from training.loop import Recipe, Run, train
+    from training.loop import Run, train
     from training.sampler import Sampler
 
     directory: Path = arguments.directory
-    run = Run(Checkpoint.load(directory / f"{arguments.name}.pt"), Recipe(warmup_steps=0))
+    (directory / "train.pid").write_text(str(os.getpid()))
+    run = Run(Checkpoint.load(directory / f"{arguments.name}.pt"), _recipe(arguments, warmup_steps=0))
     train(
         run,
         Sampler(ChainStore.load(directory / "chains.npz")),
@@ -142,6 +148,13 @@ def _cooldown(arguments: argparse.Namespace) -> None:
         steps=arguments.steps,
         cooling=True,
     )
+
+
+def _recipe(arguments: argparse.Namespace, warmup_steps: int) -> Recipe:
+    from training.loop import Recipe
+
+    recipe = Recipe(warmup_steps=warmup_steps)
+    return recipe if arguments.learning_rate is None else replace(recipe, learning_rate=arguments.learning_rate)
 
 
 def _plot(arguments: argparse.Namespace) -> None:

@@ -165,7 +165,7 @@ class LinesetNetwork(nn.Module):
 
     def _told(self, values: Tensor, features: Tensor, layout: Layout) -> Tensor:
         with torch.no_grad(), torch.autocast("cpu", enabled=False):
-            told: Tensor = self.straightening(layout.spread(values), features)
+            told: Tensor = self.straightening(layout.spread(self.straightening.curves(values)), features)
             return told
 
     def _estimate(self, state: Tensor, before: list[Tensor]) -> Tensor:

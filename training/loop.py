@@ -34,8 +34,8 @@ REPORT_EVERY_S = 30.0
 class Recipe:
     """How a run learns. `nonlinear_weight` against 1 for the error of all: lenses first, pose second."""
 
-    batch_size: int = 256
-    learning_rate: float = 1.0e-3
+    batch_size: int = 128
+    learning_rate: float = 7.0e-4
     warmup_steps: int = 400
     weight_decay: float = 0.01
     average_decay: float = 0.999

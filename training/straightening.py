@@ -48,17 +48,23 @@ class Straightening(nn.Module):
         self.register_buffer("by_anchor", _monomials(ANCHORS), persistent=False)
         self.register_buffer("legendre", _legendre_projection(), persistent=False)
 
-    def forward(self, values: Tensor, features: Tensor) -> Tensor:
-        """values: (..., 72) node values; features: (..., FEATURES) of chains, whose first 2 SAMPLES are the chain's
+    def curves(self, values: Tensor) -> Tensor:
+        """Node values (B, 72) as monomials in both variables, (B, 2 K (degree + 1)): for rows, then columns, the
+        coefficient of target^k along^d at k (degree + 1) + d."""
+        shape = (len(values), 2, len(ANCHORS), len(NODES))
+        return (self.by_anchor.t() @ (values.view(shape) @ self.by_node)).flatten(1)
+
+    def forward(self, curves: Tensor, features: Tensor) -> Tensor:
+        """curves: (..., 72) of `curves`; features: (..., FEATURES) of chains, whose first 2 SAMPLES are the chain's
         points; leading shapes broadcast. Returns (..., FEEDBACK).
 
         Per chain, in reference pixels: the offsets of its straightened points across it; the second and third Legendre
         coefficients of these, corrected by what all points of the chain say beyond the samples; its direction.
         """
         x, y = features[..., :SAMPLES], features[..., SAMPLES : 2 * SAMPLES]
-        half = values.shape[-1] // 2
-        t = self._target(values[..., :half], x, y)
-        s = self._target(values[..., half:], y, x)
+        half = curves.shape[-1] // 2
+        t = self._target(curves[..., :half], x, y)
+        s = self._target(curves[..., half:], y, x)
         offset, cos, sin = _across(s, t)
         before, _, _ = _across(x, y)
         fitted = offset @ self.legendre
@@ -69,19 +75,17 @@ class Straightening(nn.Module):
         direction = torch.cat([2 * cos * cos - 1, 2 * sin * cos, horizontal, _asinh(deviation * (90 / math.pi))], -1)
         return torch.cat([_asinh(offset / 0.5), _asinh(bend / 0.3), _asinh(bend / 0.05) / 3, direction], -1)
 
-    def _target(self, guides: Tensor, along: Tensor, across: Tensor) -> Tensor:
-        """Target coordinate of points: solves sum_k L_k(t) P_k(along) = across for t by Newton's method.
+    def _target(self, monomials: Tensor, along: Tensor, across: Tensor) -> Tensor:
+        """Target coordinate of points: solves sum_k sum_d m_kd t^k along^d = across for t by Newton's method.
 
-        guides: (..., 36) node values of one direction's guides. along, across: (..., SAMPLES).
+        monomials: (..., K (degree + 1)). along, across: (..., SAMPLES).
         """
-        shape = guides.shape[:-1]
-        coefficients = guides.reshape(*shape, len(ANCHORS), len(NODES)) @ self.by_node
-        in_target = self.by_anchor.t() @ coefficients
-        power = torch.ones_like(along)
-        curves = [torch.zeros_like(along) for _ in range(len(ANCHORS))]
-        for degree in range(len(NODES)):
-            curves = [c + in_target[..., k, degree, None] * power for k, c in enumerate(curves)]
-            power = power * along
+        curves = []
+        for first in range(0, monomials.shape[-1], len(NODES)):
+            curve = monomials[..., first + len(NODES) - 1, None]
+            for degree in range(len(NODES) - 2, -1, -1):
+                curve = curve * along + monomials[..., first + degree, None]
+            curves.append(curve)
         target = across
         for _ in range(_NEWTON_STEPS):
             value, slope = curves[-1], torch.zeros_like(across)

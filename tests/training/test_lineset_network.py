@@ -68,8 +68,8 @@ def test_true_guides_straighten_bent_chains() -> None:
                          np.ones((1, 2), np.float32), np.full(1, 1 / 128, np.float32))  # fmt: skip
     features = torch.tensor(describe(points).features)
     feedback = Straightening()
-    before = feedback(torch.tensor(STRAIGHT, dtype=torch.float32).expand(3, -1), features)
-    after = feedback(labels.expand(3, -1), features)
+    before = feedback(feedback.curves(torch.tensor(STRAIGHT, dtype=torch.float32).expand(3, -1)), features)
+    after = feedback(feedback.curves(labels.expand(3, -1)), features)
     assert before[:, 12].abs().min() > 1.5
     assert after[:, 12].abs().max() < 0.7
 
