@@ -346,7 +346,7 @@ async def read_to_the_end(call: grpc.aio.StreamStreamCall[Request, Response]) ->
 
 
 async def eventually(condition) -> None:
-    for _ in range(200):
+    for _ in range(500):
         if condition():
             return
         await asyncio.sleep(0.02)
