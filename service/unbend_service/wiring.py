@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import os
-
 from unbend_service.adapters.codecs.pillow import PillowCodec
+from unbend_service.adapters.cores import usable_cores
 from unbend_service.adapters.drawing.overlay import OverlayIllustrator
 from unbend_service.adapters.estimators.catalogue import load_estimator
 from unbend_service.adapters.grid_stores.memory import MemoryGridStore
@@ -21,11 +20,6 @@ from unbend_service.application.ports import GridStore
 from unbend_service.application.service import Service
 from unbend_service.application.streams import Streams
 from unbend_service.settings import Settings
-
-
-def usable_cores() -> int:
-    """Cores that this process may run on."""
-    return len(os.sched_getaffinity(0))
 
 
 def build_store(settings: Settings) -> GridStore:

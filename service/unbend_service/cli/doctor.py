@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import socket
 import sys
 from collections.abc import Callable, Iterator
@@ -16,6 +15,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from unbend_service.adapters.cores import usable_cores
 from unbend_service.adapters.estimators.catalogue import load_estimator
 from unbend_service.adapters.renderers.egl import EglRenderer
 from unbend_service.cli.reporting import EXIT_FAILED, console, print_json
@@ -58,12 +58,12 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print the findi
 
 
 def examine(settings: Settings) -> Iterator[Finding]:
-    """Looks at versions, cores, EGL, the model, shared memory, ports and extras."""
+    """Looks at versions, cores, EGL, the model, memory, ports and extras."""
     yield Finding("unbend", "ok", f"{metadata.version('unbend')} on Python {sys.version.split()[0]}")
-    yield Finding("cores", "ok", f"{len(os.sched_getaffinity(0))} usable of {os.cpu_count()}")
+    yield Finding("cores", "ok", f"{usable_cores()} usable of {os.cpu_count()}")
     yield _renderer(settings)
     yield _model(settings)
-    yield _shared_memory(settings)
+    yield _memory(settings)
     yield _port("HTTP port", settings.http_host, settings.http_port, "UNBEND_HTTP_PORT")
     yield _port("gRPC port", settings.grpc_host, settings.grpc_port, "UNBEND_GRPC_PORT")
     for extra, module in _EXTRAS.items():
@@ -111,18 +111,19 @@ def _model(settings: Settings) -> Finding:
     return Finding("model", "ok", f"{info.name}, sha256 {info.sha256[:16]}…")
 
 
-def _shared_memory(settings: Settings) -> Finding:
-    free_mib = shutil.disk_usage("/dev/shm").free >> 20
+def _memory(settings: Settings) -> Finding:
+    """Frames under way live in memfds, which count as memory and not against the size of /dev/shm."""
+    available_mib = _available_mib()
     wanted_mib = settings.shared_memory_bytes >> 20
-    detail = f"{free_mib} MiB free in /dev/shm, at most {wanted_mib} MiB wanted"
-    if free_mib >= wanted_mib:
-        return Finding("shared memory", "ok", detail)
-    return Finding(
-        "shared memory",
-        "note",
-        detail,
-        "lower UNBEND_SHARED_MEMORY_BYTES, or start the container with a larger --shm-size",
-    )
+    detail = f"{available_mib} MiB available, at most {wanted_mib} MiB wanted for frames under way"
+    if available_mib >= wanted_mib:
+        return Finding("memory", "ok", detail)
+    return Finding("memory", "note", detail, "lower UNBEND_SHARED_MEMORY_BYTES")
+
+
+def _available_mib() -> int:
+    with open("/proc/meminfo") as table:
+        return next(int(line.split()[1]) >> 10 for line in table if line.startswith("MemAvailable"))
 
 
 def _port(name: str, host: str, port: int, setting: str) -> Finding:

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import onnxruntime as ort
 
+from unbend_service.adapters.cores import usable_cores
 from unbend_service.domain.errors import ModelUnavailable
-
-
-def usable_cores() -> int:
-    """Cores that this process may run on."""
-    return len(os.sched_getaffinity(0))
 
 
 def open_session(weights: Path, threads: int) -> ort.InferenceSession:

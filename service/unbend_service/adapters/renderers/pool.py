@@ -8,9 +8,9 @@ import math
 import numpy as np
 import structlog
 
+from unbend_service.adapters.cores import usable_cores
 from unbend_service.adapters.renderers.channel import Done, Failed
 from unbend_service.adapters.renderers.copies import Copies
-from unbend_service.adapters.renderers.cores import usable_cores
 from unbend_service.adapters.renderers.jobs import Job, JobQueue, preferred_worker
 from unbend_service.adapters.renderers.selection import RendererOptions
 from unbend_service.adapters.renderers.slots import SlotPool

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from unbend_service.adapters.renderers.cores import usable_cores
+from unbend_service.adapters.cores import usable_cores
 
 
 @pytest.fixture(autouse=True)
