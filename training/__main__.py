@@ -200,8 +200,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     from training.evaluation import measure, measure_harm, table, write
     from training.export import export
     from training.protocol import photographs
-    from unbend_service.adapters.estimators.cards import read_card
-    from unbend_service.adapters.estimators.lineset import LinesetEstimator
+    from unbend_service.adapters.estimators.catalogue import load_estimator
 
     directory: Path = arguments.directory / "evaluations"
     weights: Path | None = arguments.weights
@@ -211,7 +210,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
         title = f"{arguments.name}, {checkpoint.samples / 1e6:.2f} M samples, {checkpoint.seconds / 3600:.2f} h"
         weights = directory / f"{arguments.name}.onnx"
         export(checkpoint, weights)
-    estimator = LinesetEstimator(read_card(str(weights)), arguments.threads)
+    estimator = load_estimator(str(weights), arguments.threads)
     pictures = photographs(arguments.photos, "val", arguments.limit)
     text = table(measure(estimator, pictures), measure_harm(estimator, pictures), arguments.threshold, title)
     write(text, directory / f"{weights.stem}-{arguments.limit}.md")

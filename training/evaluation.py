@@ -18,6 +18,7 @@ import numpy.typing as npt
 from training.distortions import DistortionBatch
 from training.protocol import FAMILIES, LZSL_SIX, Bytes, cases
 from unbend_service.adapters.estimators.lineset import Evidence, LinesetEstimator
+from unbend_service.application.ports import Estimator
 from unbend_service.domain.decision import spin_grid
 from unbend_service.domain.errors import InvalidGrid, InvalidGuides
 from unbend_service.domain.guides import Guides
@@ -45,14 +46,13 @@ class Measurement:
 
 
 def measure(
-    estimator: LinesetEstimator, photographs: list[Bytes], families: Iterable[str] = FAMILIES, seed: int | None = None
+    estimator: Estimator, photographs: list[Bytes], families: Iterable[str] = FAMILIES, seed: int | None = None
 ) -> list[Measurement]:
     """Every photograph under every family; see `protocol.cases` for the seed."""
     measurements = []
     for family in families:
         for case in cases(family, photographs, seed):
-            guides, evidence = estimator.examine(case.picture)
-            confidence = estimator.confidence(evidence)
+            guides, evidence, confidence = _look(estimator, case.picture)
             target, truth = true_correspondences(case.distortion)
             overall_nothing, nonlinear_nothing = map_errors(lambda points: points, target, truth)
             try:
@@ -63,6 +63,14 @@ def measure(
                 Measurement(family, overall_nothing, overall, nonlinear_nothing, nonlinear, evidence, confidence)
             )
     return measurements
+
+
+def _look(estimator: Estimator, picture: Bytes) -> tuple[Guides, Evidence | None, float]:
+    if isinstance(estimator, LinesetEstimator):
+        guides, evidence = estimator.examine(picture)
+        return guides, evidence, estimator.confidence(evidence)
+    estimate = estimator.estimate(picture)
+    return estimate.guides, None, estimate.confidence
 
 
 def true_correspondences(distortion: DistortionBatch) -> tuple[Float64, Float64]:
@@ -121,7 +129,7 @@ def _residual(backward: BackwardMap, target: Float64, truth: Float64, p: Float64
     return here - truth, jacobian.reshape(-1, 8)
 
 
-def measure_harm(estimator: LinesetEstimator, photographs: list[Bytes]) -> Float64:
+def measure_harm(estimator: Estimator, photographs: list[Bytes]) -> Float64:
     """(n, 2): mean displacement of undistorted whole photographs by the nonlinear correction, px at 256 on the long
     side, and the confidence."""
     rows = []
@@ -166,10 +174,9 @@ def table(measurements: list[Measurement], harm: Float64, threshold: float, titl
             f" {np.median(overall):.2f} | {nothing.mean():.2f} | {raw.mean():.2f} | {np.median(raw):.2f} |"
             f" {applied.mean():.2f} | {(applied > nothing + 0.25).mean():.2f} | {used.mean():.2f} |"
         )
-    six = [m for m in measurements if m.family in LZSL_SIX]
-    if six:
-        means = [np.mean([[m.overall_nothing, m.overall] for m in six if m.family == f], 0) for f in LZSL_SIX]
-        nothing_mean, mean = np.mean(means, 0)
+    six = [[(m.overall_nothing, m.overall) for m in measurements if m.family == family] for family in LZSL_SIX]
+    if all(six):
+        nothing_mean, mean = np.mean([np.mean(pairs, 0) for pairs in six], 0)
         lines += ["", f"All, mean of six: {nothing_mean:.2f} (nothing) -> **{mean:.2f}**."]
     if len(harm):
         moved = np.where(harm[:, 1] >= threshold, harm[:, 0], 0.0)
