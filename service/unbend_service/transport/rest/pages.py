@@ -1,4 +1,7 @@
-"""/, /docs and their assets: plain files, nothing from another host."""
+"""/, /docs and their assets: plain files, nothing from another host.
+
+Every file below ``web/`` has a route of its own, made at start; no path of a request ever reaches the file system.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +11,15 @@ from fastapi import APIRouter, Response
 
 WEB_FOLDER = Path(__file__).resolve().parents[2] / "web"
 
-_PAGES = {"/": "index.html", "/docs": "docs.html", "/web/docs.js": "docs.js", "/web/style.css": "style.css"}
-_MEDIA_TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}
+_PAGES = {"/": "index.html", "/docs": "docs.html"}
+_MEDIA_TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".svg": "image/svg+xml",
+    ".jpg": "image/jpeg",
+    ".png": "image/png",
+}
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
     "img-src 'self' data: blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -19,17 +29,24 @@ _HEADERS = {
 }
 
 
-def router() -> APIRouter:
-    """One route per file; none of them in OpenAPI."""
+def router(pages: dict[str, str] | None = None) -> APIRouter:
+    """One route per file; none of them in OpenAPI.
+
+    Args:
+        pages: addresses of the documents; those of the service if left out.
+    """
     routes = APIRouter(include_in_schema=False)
-    for path, name in _PAGES.items():
+    for path, name in (_PAGES if pages is None else pages).items():
         _add_page(routes, path, WEB_FOLDER / name)
+    for file in sorted(WEB_FOLDER.rglob("*")):
+        if file.suffix in _MEDIA_TYPES and file.suffix != ".html":
+            _add_page(routes, f"/web/{file.relative_to(WEB_FOLDER).as_posix()}", file)
     return routes
 
 
 def _add_page(routes: APIRouter, path: str, file: Path) -> None:
     content = file.read_bytes()
-    media_type = f"{_MEDIA_TYPES[file.suffix]}; charset=utf-8"
+    media_type = _MEDIA_TYPES[file.suffix]
 
     @routes.get(path)
     async def page() -> Response:

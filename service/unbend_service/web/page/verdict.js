@@ -1,0 +1,39 @@
+// What was decided, in sentences.
+
+const percent = (share) => `${Math.round(100 * share)} %`;
+
+function trust({ confidence, confidence_kind: kind }) {
+  if (kind === "calibrated_probability") return `The service is ${percent(confidence)} sure that this makes the picture better.`;
+  if (kind === "mirror_agreement") return `The estimate agrees to ${percent(confidence)} with the one of the mirrored picture.`;
+  return "";
+}
+
+const ALONE = {
+  low_confidence: ["Left as it is", (record) => `The distortion could not be told with enough certainty (${percent(record.confidence)}), and a wrong correction is worse than none.`],
+  nothing_to_correct: ["Left as it is", () => "Nothing in this picture is bent by more than a fraction of a pixel, so nothing was changed."],
+  folded: ["Left as it is", () => "The estimated correction would fold the picture over itself, so nothing was changed."],
+};
+
+/** @returns {{title: string, sentence: string}} */
+export function verdict(state, derived) {
+  const { record } = state;
+  if (state.edited) {
+    return { title: "Straightened by hand", sentence: "The picture follows your guides." };
+  }
+  if (record.outcome === "left_alone" && !state.anyway) {
+    const [title, sentence] = ALONE[record.reason] ?? ["Left as it is", () => "Nothing was changed."];
+    return { title, sentence: sentence(record) };
+  }
+  const moved = (derived.blended.displacement * state.picture.width) / 2;
+  const moves = `On average a point moves by ${moved < 10 ? moved.toFixed(1) : Math.round(moved)} pixels.`;
+  const weaker = derived.weakened < 1 ? ` Only ${percent(derived.weakened)} of the estimate is applied; more would fold the picture.` : "";
+  if (state.anyway) return { title: "Corrected at your word", sentence: `${moves} The service itself would have left the picture alone.` };
+  return { title: "Straightened", sentence: `${moves} ${trust(record)}${weaker}`.trim() };
+}
+
+export function facts({ picture, record }) {
+  const found = { Picture: `${picture.width} × ${picture.height}` };
+  if (picture.preview.width < picture.width) found.Preview = `${picture.preview.width} × ${picture.preview.height}`;
+  if (record.model) found.Model = record.model;
+  return found;
+}
