@@ -37,7 +37,7 @@ def service_over_fakes(settings: Settings, store: MemoryGridStore | None = None)
         estimation, codec, store, grids, pool, blocking, meter, jpeg_quality=92, deadline_s=settings.render_deadline_s
     )
     streams = Streams(estimation, correction, store, codec, blocking, meter, settings)
-    library = GridLibrary(store, grid_points=settings.grid_points)
+    library = GridLibrary(store, blocking, grid_points=settings.grid_points)
     return Service(
         estimation=estimation,
         correction=correction,

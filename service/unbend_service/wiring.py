@@ -66,7 +66,7 @@ def build_service(settings: Settings, meter: PrometheusMeter | None = None) -> S
     illustration = Illustration(
         estimation, codec, store, OverlayIllustrator(), blocking, jpeg_quality=settings.jpeg_quality
     )
-    grids = GridLibrary(store, grid_points=settings.grid_points)
+    grids = GridLibrary(store, blocking, grid_points=settings.grid_points)
     streams = Streams(estimation, correction, store, codec, blocking, meter, settings)
     return Service(
         estimation, correction, illustration, grids, streams, pool, store, codec, meter, blocking, estimator.model

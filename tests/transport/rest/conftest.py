@@ -66,7 +66,7 @@ class Bench:
             estimation=estimation,
             correction=correction,
             illustration=illustration,
-            grids=GridLibrary(store, grid_points=settings.grid_points),
+            grids=GridLibrary(store, blocking, grid_points=settings.grid_points),
             streams=Streams(estimation, correction, store, codec, blocking, meter, settings),
             pool=self.pool,
             store=store,
