@@ -115,9 +115,7 @@ def _trace(grey: npt.NDArray[np.uint8]) -> _Points | None:
     return _split_at_corners(x, y, strength, chain)
 
 
-def _simple_edges(
-    gradient_x: FloatArray, gradient_y: FloatArray, magnitude: FloatArray
-) -> BoolArray:
+def _simple_edges(gradient_x: FloatArray, gradient_y: FloatArray, magnitude: FloatArray) -> BoolArray:
     """Canny edges in which no pixel has more than two neighbours: bool (h, w)."""
     strong = max(float(np.percentile(magnitude[::2, ::2], STRONG_EDGE_PERCENTILE)), STRONG_EDGE_FLOOR)
     edges: BoolArray = (
