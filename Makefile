@@ -20,6 +20,10 @@ $(VENV)/.dev: pyproject.toml $(CONSTRAINTS) | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS) -e '.[service,video]' --group dev
 	@touch $@ $(VENV)/.service
 
+$(VENV)/.e2e: pyproject.toml $(CONSTRAINTS) $(VENV)/.dev
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS) --group e2e
+	@touch $@
+
 $(VENV)/.training: pyproject.toml $(VENV)/.dev
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS) --group training
 	@touch $@
@@ -34,6 +38,9 @@ serve: setup  ## Serve HTTP on 127.0.0.1:8080 and gRPC on 127.0.0.1:50051
 test: setup-dev  ## Run the tests
 	$(BIN)/python -m pytest
 
+e2e: $(VENV)/.e2e  ## Drive the pages in Chromium; screenshots go to artifacts/
+	$(BIN)/python -m pytest -m e2e tests/e2e
+
 check: setup-dev  ## Lint, types, layers, generated code
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -44,7 +51,7 @@ check: setup-dev  ## Lint, types, layers, generated code
 proto: setup-dev  ## Generate client/unbend/v1 from proto/
 	$(BIN)/python proto/generate.py
 
-.PHONY: help setup setup-dev serve test check proto
+.PHONY: help setup setup-dev serve test e2e check proto
 
 PHOTOS ?= ../shared/photos
 

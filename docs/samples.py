@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from unbend_service.application.exports import opencv_maps
-from unbend_service.domain.grid import Grid
+from unbend_service.domain.maps import pixel_centres
 
 DOCS = Path(__file__).parent
 SAMPLES = DOCS.parent / "service/unbend_service/web/samples"
@@ -43,7 +42,7 @@ def draw_facade(width: int = WIDTH, height: int = HEIGHT, seed: int = 5) -> npt.
         cv2.rectangle(image, (0, top + high // 40), (wide, top + high // 40 + 9), (110, 120, 130), -1)
         for bay in range(bays):
             _draw_window(image, rng, wide * bay // bays, top, wide // bays, high // storeys)
-    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def _draw_window(
@@ -66,21 +65,19 @@ def bend(picture: npt.NDArray[np.uint8], strength: float = BEND) -> npt.NDArray[
     """The picture as a lens of the division model would show it; (height, width, 3) uint8."""
     height, width = picture.shape[:2]
     aspect = np.array([width, height]) / np.hypot(width, height)
-
-    def source_of(target: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        radius_squared = ((target * aspect) ** 2).sum(axis=-1, keepdims=True)
-        return np.asarray(target * min(1.0, 1 - strength) / (1 - strength * radius_squared))
-
-    map_x, map_y = opencv_maps(Grid.from_map(source_of), width, height)
-    bent = cv2.remap(picture, map_x, map_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    target = np.stack(np.meshgrid(pixel_centres(width), pixel_centres(height)), axis=-1)
+    radius_squared = ((target * aspect) ** 2).sum(axis=-1, keepdims=True)
+    source = target * min(1.0, 1 - strength) / (1 - strength * radius_squared)
+    pixels = ((source + 1) / 2 * (width, height) - 0.5).astype(np.float32)
+    bent = cv2.remap(picture, pixels[..., 0], pixels[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(bent, dtype=np.uint8)
 
 
 def main() -> None:
     """Writes both samples."""
     SAMPLES.mkdir(exist_ok=True)
-    photo = cv2.imread(str(DOCS / "pictures/bent.jpg"))
-    small = cv2.resize(photo, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
+    photo = np.asarray(cv2.imread(str(DOCS / "pictures/bent.jpg")), dtype=np.uint8)
+    small = np.asarray(cv2.resize(photo, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA), dtype=np.uint8)
     for name, picture in (("shopfront", small), ("facade", bend(draw_facade()))):
         cv2.imwrite(str(SAMPLES / f"{name}.jpg"), picture, [cv2.IMWRITE_JPEG_QUALITY, 82])
 

@@ -65,9 +65,9 @@ export async function exported(id, query) {
 
 /** The export formats that this service has, as its own description lists them. */
 export async function exportFormats() {
-  const { paths } = await (await call("/openapi.json")).json();
-  const { parameters } = paths["/v1/grids/{grid_id}/export"].get;
-  return parameters.find((one) => one.name === "format").schema.enum;
+  const { paths, components } = await (await call("/openapi.json")).json();
+  const { schema } = paths["/v1/grids/{grid_id}/export"].get.parameters.find((one) => one.name === "format");
+  return (schema.enum ?? components.schemas[schema.$ref.split("/").pop()].enum).filter((one) => typeof one === "string");
 }
 
 export async function sample(name) {

@@ -120,9 +120,9 @@ function control(derived) {
   }
   get("adjust").setAttribute("aria-expanded", adjusting);
   get("adjust").disabled = !state.guides;
-  setText("adjust", adjusting ? "Done" : "Drag the guides");
   get("adjusting").hidden = !adjusting;
-  setText("hint", adjusting ? "Drag a point, or a whole curve. The result follows." : "Drag across the picture to compare.");
+  get("hint").hidden = adjusting;
+  setText("hint", isLeftAlone() ? "Both sides are the same." : "Drag across the picture to compare.");
   if (state.guides) setText("guide-name", editor.name());
   get("undo").disabled = !editor.history.length;
   get("reset").disabled = !state.edited;
@@ -178,6 +178,16 @@ async function save() {
   announce(`Saved as the grid ${id}`);
 }
 
+/** Into the adjusting view, the focus on a control point; and back, the focus where it came from. */
+function adjust(adjusting) {
+  update({ view: adjusting ? "adjust" : "compare" });
+  requestAnimationFrame(() => {
+    const focused = adjusting ? document.querySelector("#editor .handle") : get("adjust");
+    focused?.focus({ preventScroll: !adjusting });
+    if (adjusting) get("work").scrollIntoView({ block: "nearest" });
+  });
+}
+
 const on = (id, event, act) => get(id).addEventListener(event, act);
 on("choose", "click", () => get("file").click());
 on("file", "change", (event) => { if (event.target.files[0]) accept(event.target.files[0]); event.target.value = ""; });
@@ -194,7 +204,8 @@ for (const button of document.querySelectorAll("[data-overlay]")) {
   const name = button.dataset.overlay;
   button.addEventListener("click", () => update({ overlays: { ...state.overlays, [name]: !state.overlays[name] } }));
 }
-on("adjust", "click", () => update({ view: state.view === "adjust" ? "compare" : "adjust" }));
+on("adjust", "click", () => adjust(state.view !== "adjust"));
+on("done", "click", () => adjust(false));
 on("guide-back", "click", () => editor.step(-1));
 on("guide-next", "click", () => editor.step(1));
 on("undo", "click", () => editor.undo());

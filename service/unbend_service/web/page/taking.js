@@ -4,7 +4,8 @@ import { correct, exportFormats, exported, saveGrid } from "./api.js";
 import { derive, isEstimate, isLeftAlone, state } from "./state.js";
 
 const LABELS = {
-  json: "Grid as JSON", npz: "OpenCV maps (.npz)", exr: "STMap (.exr)", tiff: "STMap (.tiff)", stmap: "STMap", pgm: "ffmpeg maps (.pgm)",
+  json: "Grid (JSON)", npz: "OpenCV maps", "npz-fixed": "OpenCV maps, fixed point", "stmap-exr": "STMap (EXR)",
+  "stmap-tiff": "STMap (TIFF)", ffmpeg: "ffmpeg maps",
 };
 
 /**
@@ -50,15 +51,13 @@ export function snippets(id) {
   };
 }
 
-/** [{label, take}] for every export that the service has. Maps for programs without a notion of a frame carry it. */
+/** [{label, take}] for every export that the service has. Maps of other programs carry the frame; the JSON does not. */
 export async function exports(id) {
   return (await exportFormats()).map((format) => ({
     label: LABELS[format] ?? format,
     async take() {
-      let of = id;
-      if (format !== "json" && state.fit !== null) of = await saveGrid({ grid: derive().fitted.toJson(), outcome: "corrected" });
       const { width, height } = state.picture;
-      const { file, name } = await exported(of, { format, width, height });
+      const { file, name } = await exported(id, format === "json" ? { format } : { format, width, height, fit: fitOption() });
       hand(file, name);
     },
   }));

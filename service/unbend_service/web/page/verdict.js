@@ -1,6 +1,6 @@
 // What was decided, in sentences.
 
-const percent = (share) => `${Math.round(100 * share)} %`;
+const percent = (share) => `${Math.round(100 * share)}\u00a0%`;
 
 function trust({ confidence, confidence_kind: kind }) {
   if (kind === "calibrated_probability") return `The service is ${percent(confidence)} sure that this makes the picture better.`;
@@ -25,7 +25,7 @@ export function verdict(state, derived) {
     return { title, sentence: sentence(record) };
   }
   const moved = (derived.blended.displacement * state.picture.width) / 2;
-  const moves = `On average a point moves by ${moved < 10 ? moved.toFixed(1) : Math.round(moved)} pixels.`;
+  const moves = `On average a point moves by ${moved < 10 ? moved.toFixed(1) : Math.round(moved)}\u00a0pixels.`;
   const weaker = derived.weakened < 1 ? ` Only ${percent(derived.weakened)} of the estimate is applied; more would fold the picture.` : "";
   if (state.anyway) return { title: "Corrected at your word", sentence: `${moves} The service itself would have left the picture alone.` };
   return { title: "Straightened", sentence: `${moves} ${trust(record)}${weaker}`.trim() };
