@@ -5,10 +5,12 @@ from __future__ import annotations
 from tests.fakes import FAKE_MODEL, FakeEstimator, FakeRenderPool, RecordingMeter
 from unbend_service.adapters.codecs.pillow import PillowCodec
 from unbend_service.adapters.drawing.overlay import OverlayIllustrator
+from unbend_service.adapters.exchange.files import ExchangeFiles
 from unbend_service.adapters.grid_stores.memory import MemoryGridStore
 from unbend_service.application.blocking import BlockingWork
 from unbend_service.application.correction import Correction
 from unbend_service.application.estimation import Estimation
+from unbend_service.application.exchange import Exchange
 from unbend_service.application.fitting import FittedGrids
 from unbend_service.application.grids import GridLibrary
 from unbend_service.application.illustration import Illustration
@@ -43,6 +45,7 @@ def service_over_fakes(settings: Settings, store: MemoryGridStore | None = None)
         correction=correction,
         illustration=Illustration(estimation, codec, store, OverlayIllustrator(), blocking, jpeg_quality=92),
         grids=library,
+        exchange=Exchange(ExchangeFiles(), grids, blocking),
         streams=streams,
         pool=pool,
         store=store,

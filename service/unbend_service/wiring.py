@@ -6,6 +6,7 @@ from unbend_service.adapters.codecs.pillow import PillowCodec
 from unbend_service.adapters.cores import usable_cores
 from unbend_service.adapters.drawing.overlay import OverlayIllustrator
 from unbend_service.adapters.estimators.catalogue import load_estimator
+from unbend_service.adapters.exchange.files import ExchangeFiles
 from unbend_service.adapters.grid_stores.memory import MemoryGridStore
 from unbend_service.adapters.grid_stores.sqlite import SqliteGridStore
 from unbend_service.adapters.metrics.prometheus import PrometheusMeter
@@ -13,6 +14,7 @@ from unbend_service.adapters.renderers.pool import WorkerPool
 from unbend_service.application.blocking import BlockingWork
 from unbend_service.application.correction import Correction
 from unbend_service.application.estimation import Estimation
+from unbend_service.application.exchange import Exchange
 from unbend_service.application.fitting import FittedGrids
 from unbend_service.application.grids import GridLibrary
 from unbend_service.application.illustration import Illustration
@@ -67,7 +69,19 @@ def build_service(settings: Settings, meter: PrometheusMeter | None = None) -> S
         estimation, codec, store, OverlayIllustrator(), blocking, jpeg_quality=settings.jpeg_quality
     )
     grids = GridLibrary(store, blocking, grid_points=settings.grid_points)
+    exchange = Exchange(ExchangeFiles(), fitted_grids, blocking)
     streams = Streams(estimation, correction, store, codec, blocking, meter, settings)
     return Service(
-        estimation, correction, illustration, grids, streams, pool, store, codec, meter, blocking, estimator.model
+        estimation,
+        correction,
+        illustration,
+        grids,
+        exchange,
+        streams,
+        pool,
+        store,
+        codec,
+        meter,
+        blocking,
+        estimator.model,
     )

@@ -8,9 +8,11 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from unbend_service.domain.exchange import DenseMap, ExportedFile, ExportFormat, ImportFormat
 from unbend_service.domain.frames import Border, Frame
 from unbend_service.domain.grid import Grid
 from unbend_service.domain.guides import Guides
+from unbend_service.domain.maps import BackwardMap
 from unbend_service.domain.records import GridRecord
 
 Bytes = npt.NDArray[np.uint8]
@@ -243,6 +245,40 @@ class ImageCodec(Protocol):
 
         Raises:
             InvalidOption: a format that is not written.
+        """
+        ...
+
+
+class GridFiles(Protocol):
+    """Grids as the files of other programs. Thread-safe; blocking."""
+
+    def write_record(self, record: GridRecord) -> ExportedFile:
+        """The JSON of the API."""
+        ...
+
+    def read_record(self, body: bytes) -> GridRecord:
+        """Inverse of :meth:`write_record`; a grid or guides alone are accepted too.
+
+        Raises:
+            InvalidGrid, InvalidGuides.
+        """
+        ...
+
+    def write_map(self, kind: ExportFormat, dense: DenseMap) -> ExportedFile:
+        """Any format but json.
+
+        Raises:
+            InvalidOption: a size that the format cannot hold.
+            Unavailable: the library that writes it is not installed.
+        """
+        ...
+
+    def read_map(self, kind: ImportFormat, body: bytes) -> BackwardMap:
+        """Any format but json; target -> source, centred.
+
+        Raises:
+            InvalidGrid: the file is broken or holds something else.
+            Unavailable: the library that reads it is not installed.
         """
         ...
 

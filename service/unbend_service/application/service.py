@@ -9,6 +9,7 @@ from unbend_service.application.admission import Admission
 from unbend_service.application.blocking import BlockingWork
 from unbend_service.application.correction import Correction
 from unbend_service.application.estimation import Estimation
+from unbend_service.application.exchange import Exchange
 from unbend_service.application.grids import GridLibrary
 from unbend_service.application.illustration import Illustration
 from unbend_service.application.ports import GridStore, ImageCodec, Meter, ModelInfo, PoolState, RenderPool
@@ -43,6 +44,7 @@ class Service:
     correction: Correction
     illustration: Illustration
     grids: GridLibrary
+    exchange: Exchange
     streams: Streams
     pool: RenderPool
     store: GridStore

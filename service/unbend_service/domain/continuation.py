@@ -49,17 +49,31 @@ class ContinuedLattice:
 
     def __call__(self, target: Float64) -> Float64:
         """(..., 2) float64 centred target points -> (..., 2) float64 centred source points."""
+        first, width, u, v = self._cell(target)
+        corner = self.lattice.reshape(-1, 2)
+        top = corner[first] * (1 - u) + corner[first + 1] * u
+        bottom = corner[first + width] * (1 - u) + corner[first + width + 1] * u
+        return np.asarray(top * (1 - v) + bottom * v)
+
+    def jacobian(self, target: Float64) -> Float64:
+        """(n, 2) float64 target points -> (n, 2, 2) float64 derivatives, [:, i, j] = d source_i / d target_j."""
+        first, width, u, v = self._cell(target)
+        corner = self.lattice.reshape(-1, 2)
+        a, b, c, d = corner[first], corner[first + 1], corner[first + width], corner[first + width + 1]
+        height = len(self.lattice)
+        cells_across, cells_down = (width - 2 * self.column_margin - 1) / 2, (height - 2 * self.row_margin - 1) / 2
+        along_s = ((b - a) * (1 - v) + (d - c) * v) * cells_across
+        along_t = ((c - a) * (1 - u) + (d - b) * u) * cells_down
+        return np.stack([along_s, along_t], axis=-1)
+
+    def _cell(self, target: Float64) -> tuple[npt.NDArray[np.intp], int, Float64, Float64]:
+        """Index of the first corner of each target's cell, the stride of a row, and how far into the cell it lies."""
         height, width = self.lattice.shape[:2]
         column = (target[..., 0] + 1) / 2 * (width - 2 * self.column_margin - 1) + self.column_margin
         row = (target[..., 1] + 1) / 2 * (height - 2 * self.row_margin - 1) + self.row_margin
         c = np.clip(column, 0, width - 2).astype(np.intp)
         r = np.clip(row, 0, height - 2).astype(np.intp)
-        u, v = (column - c)[..., None], (row - r)[..., None]
-        corner = self.lattice.reshape(-1, 2)
-        first = r * width + c
-        top = corner[first] * (1 - u) + corner[first + 1] * u
-        bottom = corner[first + width] * (1 - u) + corner[first + width + 1] * u
-        return np.asarray(top * (1 - v) + bottom * v)
+        return r * width + c, width, (column - c)[..., None], (row - r)[..., None]
 
 
 def _continued(lattice: Float64, margin: int) -> Float64:

@@ -12,11 +12,13 @@ from PIL import Image
 from tests.fakes import FakeEstimator, FakeRenderPool
 from unbend_service.adapters.codecs.pillow import PillowCodec
 from unbend_service.adapters.drawing.overlay import OverlayIllustrator
+from unbend_service.adapters.exchange.files import ExchangeFiles
 from unbend_service.adapters.grid_stores.memory import MemoryGridStore
 from unbend_service.adapters.metrics.prometheus import PrometheusMeter
 from unbend_service.application.blocking import BlockingWork
 from unbend_service.application.correction import Correction
 from unbend_service.application.estimation import Estimation
+from unbend_service.application.exchange import Exchange
 from unbend_service.application.fitting import FittedGrids
 from unbend_service.application.grids import GridLibrary
 from unbend_service.application.illustration import Illustration
@@ -67,6 +69,7 @@ class Bench:
             correction=correction,
             illustration=illustration,
             grids=GridLibrary(store, blocking, grid_points=settings.grid_points),
+            exchange=Exchange(ExchangeFiles(), fitted, blocking),
             streams=Streams(estimation, correction, store, codec, blocking, meter, settings),
             pool=self.pool,
             store=store,

@@ -190,3 +190,48 @@ async def test_unknown_grids_are_not_found(client: httpx.AsyncClient) -> None:
     """Every way to an unknown grid is a 404."""
     for response in (await client.get("/v1/grids/gnope"), await client.get("/v1/grids/gnope/export")):
         assert (response.status_code, response.json()["code"]) == (404, "grid_not_found")
+
+
+@pytest.mark.parametrize(
+    ("query", "magic"),
+    [
+        ("format=npz-fixed", b"PK"),
+        ("format=stmap-tiff&direction=redistort", b"II*"),
+        ("format=ffmpeg&fit=crop&strength=0.5", b"PK"),
+        ("format=json&direction=redistort", b"{"),
+    ],
+)
+async def test_a_grid_travels_in_every_form(client: httpx.AsyncClient, query: str, magic: bytes) -> None:
+    """Each format comes as the file that it is, under a name that says what it is of."""
+    await client.post("/v1/grids", json={"grid": GRID.to_dict()})
+    response = await client.get(f"/v1/grids/{GRID.id}/export?{query}&width=64&height=48")
+    assert response.status_code == 200
+    assert response.content.startswith(magic)
+    assert GRID.id in response.headers["content-disposition"]
+
+
+async def test_an_exported_map_is_imported_as_the_grid_that_it_was(client: httpx.AsyncClient) -> None:
+    """A redistortion written for another program and read back as one is the correction again."""
+    await client.post("/v1/grids", json={"grid": GRID.to_dict()})
+    query = "format=stmap-tiff&direction=redistort"
+    file = await client.get(f"/v1/grids/{GRID.id}/export?{query}&width=128&height=96")
+    read = await client.post(f"/v1/grids/import?{query}&points=9", content=file.content)
+    assert read.status_code == 201
+    again = Grid.from_dict((await client.get(read.headers["location"])).json()["grid"])
+    assert np.abs(again.source - GRID.source)[1:-1, 1:-1].max() * 64 < 0.2
+
+
+@pytest.mark.parametrize(
+    ("query", "body", "code"),
+    [
+        ("format=npz", b"PK nonsense", "invalid_grid"),
+        ("format=opencv", b'{"K": 1}', "invalid_grid"),
+        ("format=stmap-tiff", b"", "invalid_grid"),
+        ("format=dng", b"x", "invalid_option"),
+        ("", b"x", "invalid_option"),
+        ("format=npz&points=1", b"x", "invalid_option"),
+    ],
+)
+async def test_a_bad_import_is_a_problem(client: httpx.AsyncClient, query: str, body: bytes, code: str) -> None:
+    response = await client.post(f"/v1/grids/import?{query}", content=body)
+    assert (response.status_code, response.json()["code"]) == (422, code)

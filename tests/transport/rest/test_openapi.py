@@ -29,6 +29,7 @@ async def test_the_calls_of_the_design_are_there(document: dict[str, Any]) -> No
         "POST /v1/estimate",
         "POST /v1/overlay",
         "POST /v1/grids",
+        "POST /v1/grids/import",
         "GET /v1/grids/{grid_id}",
         "PUT /v1/grids/{grid_id}",
         "DELETE /v1/grids/{grid_id}",

@@ -10,7 +10,7 @@ from pydantic.json_schema import models_json_schema
 
 from unbend_service.application.service import Service
 from unbend_service.settings import Settings
-from unbend_service.transport.rest import correct, estimate, grids, health, overlay, pages, problems
+from unbend_service.transport.rest import correct, estimate, exchange, grids, health, overlay, pages, problems
 from unbend_service.transport.rest.accounting import Accounting, Admitting
 from unbend_service.transport.rest.parameters import refuse_unknown
 
@@ -36,6 +36,7 @@ def create_app(service: Service, settings: Settings) -> FastAPI:
         estimate.router(service, settings),
         overlay.router(service, settings),
         grids.router(service, settings),
+        exchange.router(service, settings),
         health.router(service),
         pages.router(),
     ):

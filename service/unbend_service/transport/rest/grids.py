@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import orjson
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Request, Response
 
-from unbend_service.application.exports import MAX_MAP_PIXELS, npz_of_maps
 from unbend_service.application.service import Service
 from unbend_service.domain import errors
 from unbend_service.settings import Settings
@@ -15,11 +14,6 @@ from unbend_service.transport.rest import parameters, problems
 from unbend_service.transport.rest.bodies import read_body
 from unbend_service.transport.rest.provenance import GridBody, GridRecordBody, GuidesBody, json_of
 
-_MAP_SIDE_PX = 1 << 16
-WidthQuery = Annotated[
-    int | None,
-    Query(ge=1, le=_MAP_SIDE_PX, description=f"Of the npz maps, with height; {MAX_MAP_PIXELS} pixels in all at most."),
-]
 _UPLOAD: dict[str, Any] = {
     "required": True,
     "description": "`grid`, with whatever else an estimate says of it; or `guides` alone, and the grid is spun here.",
@@ -36,7 +30,7 @@ _UPLOAD: dict[str, Any] = {
         }
     },
 }
-_UPLOAD_ERRORS = (
+UPLOAD_ERRORS = (
     errors.BodyTooLarge,
     errors.InvalidGrid,
     errors.FoldedGrid,
@@ -68,7 +62,7 @@ def router(service: Service, settings: Settings) -> APIRouter:
         response_class=Response,
         responses={
             201: {"model": GridRecordBody, "description": "Stored; Location says where."},
-            **problems.responses(*_UPLOAD_ERRORS),
+            **problems.responses(*UPLOAD_ERRORS),
         },
         openapi_extra={"requestBody": _UPLOAD},
     )
@@ -83,7 +77,7 @@ def router(service: Service, settings: Settings) -> APIRouter:
         response_class=Response,
         responses={
             200: {"model": GridRecordBody, "description": "Stored."},
-            **problems.responses(*_UPLOAD_ERRORS, errors.GridConflict),
+            **problems.responses(*UPLOAD_ERRORS, errors.GridConflict),
         },
         openapi_extra={"requestBody": _UPLOAD},
     )
@@ -116,42 +110,4 @@ def router(service: Service, settings: Settings) -> APIRouter:
         await service.grids.delete(grid_id)
         return Response(status_code=204)
 
-    @routes.get(
-        "/{grid_id}/export",
-        summary="Export a grid",
-        response_class=Response,
-        responses={
-            200: {
-                "description": "The file.",
-                "content": {
-                    "application/json": {"schema": {"$ref": "#/components/schemas/GridRecordBody"}},
-                    "application/zip": {"schema": {"type": "string", "format": "binary"}},
-                },
-            },
-            **problems.responses(errors.GridNotFound, errors.InvalidOption, errors.QueueFull, errors.Unavailable),
-        },
-    )
-    async def export(
-        grid_id: parameters.GridIdPath,
-        format: Annotated[
-            Literal["json", "npz"],
-            Query(description="`json`: the record; `npz`: `map_x` and `map_y` for cv2.remap, float32 source pixels."),
-        ] = "json",
-        width: WidthQuery = None,
-        height: WidthQuery = None,
-    ) -> Response:
-        """For programs that do not speak grids."""
-        record = await service.grids.get(grid_id)
-        if format == "json":
-            return json_of(record, headers=_attachment(f"{record.id}.json"))
-        if width is None or height is None:
-            raise errors.InvalidOption("npz maps have a size.", allowed="width and height in pixels")
-        archive = await service.blocking.run("grid", npz_of_maps, record.grid, width, height)
-        headers = _attachment(f"{record.id}-{width}x{height}.npz")
-        return Response(archive, media_type="application/zip", headers=headers)
-
     return routes
-
-
-def _attachment(name: str) -> dict[str, str]:
-    return {"Content-Disposition": f'attachment; filename="{name}"'}
