@@ -18,6 +18,7 @@ from training.lineset_network import LinesetNetwork
 from unbend_service.adapters.estimators.chain_features import FEATURES
 
 SEARCHED_LONG_SIDE_PX = 384
+LOOKS = 2
 UNCALIBRATED = (1.0, -1.0, 1.0, 0.0, 0.0, 0.0)
 """Weights of the confidence before it is calibrated: the displacement must outweigh the expected error."""
 PARITY_TOLERANCE = 2e-4
@@ -25,7 +26,11 @@ PARITY_TOLERANCE = 2e-4
 
 
 def export(
-    checkpoint: Checkpoint, weights: Path, name: str = "lineset", confidence: tuple[float, ...] = UNCALIBRATED
+    checkpoint: Checkpoint,
+    weights: Path,
+    name: str = "lineset",
+    confidence: tuple[float, ...] = UNCALIBRATED,
+    looks: int = LOOKS,
 ) -> float:
     """Writes `weights` (.onnx) and the .json card beside it; returns the largest difference from torch.
 
@@ -56,7 +61,7 @@ def export(
     difference = parity(network, weights)
     if difference > PARITY_TOLERANCE:
         raise RuntimeError(f"ONNX Runtime differs from torch by {difference:.2e}.")
-    write_card(weights, name, confidence)
+    write_card(weights, name, confidence, looks)
     return difference
 
 
@@ -73,7 +78,7 @@ def parity(network: LinesetNetwork, weights: Path) -> float:
     return worst
 
 
-def write_card(weights: Path, name: str, confidence: tuple[float, ...]) -> None:
+def write_card(weights: Path, name: str, confidence: tuple[float, ...], looks: int) -> None:
     """The .json beside the weights, as `unbend_service.adapters.estimators.cards` reads it."""
     card: dict[str, Any] = {
         "name": name,
@@ -83,6 +88,7 @@ def write_card(weights: Path, name: str, confidence: tuple[float, ...]) -> None:
             "nodes": NODES.tolist(),
             "anchors": ANCHORS.tolist(),
             "searched_long_side_px": SEARCHED_LONG_SIDE_PX,
+            "looks": looks,
             "confidence": list(confidence),
         },
     }

@@ -96,7 +96,7 @@ class Sampler:
         points = self._points(distortions, half_extent, rng)
         source_x, source_y = evaluation_points(half_extent)
         target_x, target_y = distortions.straighten(source_x, source_y)
-        slopes, area = _slopes(distortions, source_x, source_y)
+        slopes, area = _slopes(distortions, source_x, source_y, target_x, target_y)
         weight = evaluation_weights(target_x, target_y, area, half_extent)
         some = slice(0, max(1, size // LABELLED_SHARE))
         labels = fit_labels(source_x[some], source_y[some], target_x[some], target_y[some], weight[some])
@@ -229,13 +229,14 @@ def _target_view(distortions: DistortionBatch, half_extent: Float64) -> tuple[Fl
     return low, high, np.stack([magnification.min(1), magnification.max(1)], 1)
 
 
-def _slopes(distortions: DistortionBatch, x: Float64, y: Float64) -> tuple[Float64, Float64]:
-    """d source / d target (B, n, 2, 2) and target area per source area (B, n), by central differences."""
+def _slopes(
+    distortions: DistortionBatch, x: Float64, y: Float64, target_x: Float64, target_y: Float64
+) -> tuple[Float64, Float64]:
+    """d source / d target (B, n, 2, 2) and target area per source area (B, n), by differences."""
     step = 1e-3
-    right, left = distortions.straighten(x + step, y), distortions.straighten(x - step, y)
-    below, above = distortions.straighten(x, y + step), distortions.straighten(x, y - step)
-    a, c = ((right[i] - left[i]) / (2 * step) for i in (0, 1))
-    b, d = ((below[i] - above[i]) / (2 * step) for i in (0, 1))
+    right, below = distortions.straighten(x + step, y), distortions.straighten(x, y + step)
+    a, c = (right[0] - target_x) / step, (right[1] - target_y) / step
+    b, d = (below[0] - target_x) / step, (below[1] - target_y) / step
     area = a * d - b * c
     safe = np.where(np.abs(area) < 0.02, 0.02, area)
     inverse = np.stack([np.stack([d, -b], -1), np.stack([-c, a], -1)], -2) / safe[..., None, None]

@@ -7,7 +7,8 @@ from training.calibration import calibrate, reliability
 from training.evaluation import Measurement, map_errors, table, true_correspondences
 from training.labels import ANCHORS, NODES, evaluation_points, fit_labels
 from training.protocol import FAMILIES, cases, draw_family
-from unbend_service.adapters.estimators.lineset import Evidence, guides_from_isotropic
+from unbend_service.adapters.estimators.isotropic_guides import GuideFrame
+from unbend_service.adapters.estimators.lineset import Evidence
 
 pytestmark = pytest.mark.training
 
@@ -53,9 +54,7 @@ def test_guides_fitted_to_the_truth_have_hardly_an_error(family: str) -> None:
     s, t = distortion.straighten(x, y)
     weight = np.where(np.maximum(np.abs(s), np.abs(t)) < 1.05, 1.0, 0.02)
     values = fit_labels(x, y, s, t, weight, 1e-6)[0].reshape(2, len(ANCHORS), len(NODES))
-    overall, nonlinear = map_errors(
-        guides_from_isotropic(values, NODES, ANCHORS, 1, 1), *true_correspondences(distortion)
-    )
+    overall, nonlinear = map_errors(GuideFrame(NODES, ANCHORS).guides(values), *true_correspondences(distortion))
     assert overall < 0.3
     assert nonlinear < 0.3
 

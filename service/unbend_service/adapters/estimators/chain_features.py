@@ -11,7 +11,7 @@ not depend on the direction in which it was traced.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -74,6 +74,25 @@ class ChainPoints:
     def mirrored(self) -> ChainPoints:
         """The same pictures seen in a mirror: x -> -x."""
         return ChainPoints(-self.x, self.y, self.strength, self.starts, self.picture, self.half_extent, self.pixel)
+
+    def moved(self, x: FloatArray, y: FloatArray) -> ChainPoints:
+        """The same chains elsewhere."""
+        return replace(self, x=x, y=y)
+
+    def kept(self, keep: BoolArray) -> ChainPoints:
+        """The points that stay, with a chain starting anew after each gap."""
+        chain = np.cumsum(self.starts)
+        index = np.flatnonzero(keep)
+        anew = np.ones(len(index), np.bool_)
+        anew[1:] = (chain[index[1:]] != chain[index[:-1]]) | (index[1:] != index[:-1] + 1)
+        return replace(
+            self,
+            x=self.x[index],
+            y=self.y[index],
+            strength=self.strength[index],
+            starts=anew,
+            picture=self.picture[index],
+        )
 
 
 @dataclass(frozen=True)

@@ -11,18 +11,23 @@ import numpy.typing as npt
 from unbend_service.adapters.estimators.cards import ModelCard
 from unbend_service.adapters.estimators.chain_features import FEATURES, ChainPoints, describe
 from unbend_service.adapters.estimators.chains import extract, fit_long_side
+from unbend_service.adapters.estimators.isotropic_guides import GuideFrame, mirrored
 from unbend_service.adapters.estimators.sessions import open_session
 from unbend_service.application.ports import Bytes, Estimate, ModelInfo
-from unbend_service.domain.errors import ModelUnavailable
-from unbend_service.domain.guides import GuideFamily, Guides, lagrange_basis
+from unbend_service.domain.errors import InvalidGuides, ModelUnavailable
+from unbend_service.domain.guides import Guides
 
 Float64 = npt.NDArray[np.float64]
 
 #: Fewer edge chains than this say nothing about a lens.
 FEWEST_CHAINS = 4
+INPUTS = 6
 #: Pixels of a 256 picture per half picture width.
 _PIXELS = 128.0
-_LATTICE = 13
+#: Displacement from which a second look pays: it takes a fifth off the error of strong lenses, and unsettles the rest.
+SECOND_LOOK_FROM_PX = 2.0
+#: Straightened points further out than this, in half extents of the picture, are not looked at again.
+_SECOND_LOOK_EXTENT = 1.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +47,7 @@ class Evidence:
     chains: int
 
     def inputs(self) -> Float64:
-        """(6,) float64: the inputs of the logistic regression of the card, the first of them 1."""
+        """(INPUTS,) float64: the inputs of the logistic regression of the card, the first of them 1."""
         error = math.log(max(self.expected_error, 0.01))
         size = math.log(max(self.displacement, 0.01))
         apart = math.log(max(self.disagreement, 0.01))
@@ -53,14 +58,14 @@ class LinesetEstimator:
     """Guides from the edge chains of a grey picture, through one set network.
 
     The picture is reduced, never enlarged and never squashed: chains live in the isotropic frame, so a lens keeps its
-    shape whatever the aspect of the picture. The network's answer, node values in that frame, is changed to
-    coefficients in the centred frame exactly: the guides' map is a polynomial in each variable, and so is its
-    restriction to a smaller rectangle. The picture and its mirror image are looked at in one batch and averaged.
+    shape whatever the aspect of the picture. The picture and its mirror image are looked at in one batch and averaged.
+    With two ``looks`` the chains of a strong distortion are then straightened by the first estimate and looked at
+    again, and both maps are composed: what the first look left of it is a weak one.
 
     Args:
         card: its ``parameters`` are ``nodes`` (degree + 1 positions along a guide) and ``anchors`` (K positions), both
-            in the isotropic frame and symmetric about 0; ``searched_long_side_px``; ``confidence``, the weights of a
-            logistic regression over :meth:`Evidence.inputs`.
+            in the isotropic frame and symmetric about 0; ``searched_long_side_px``; ``looks``, 1 or 2; ``confidence``,
+            the weights of a logistic regression over :meth:`Evidence.inputs`.
         threads: of one estimate; 0: as many as usable cores.
 
     Raises:
@@ -69,19 +74,24 @@ class LinesetEstimator:
 
     def __init__(self, card: ModelCard, threads: int) -> None:
         try:
-            self._nodes = np.array(card.parameters["nodes"], dtype=np.float64)
-            self._anchors = np.array(card.parameters["anchors"], dtype=np.float64)
+            self._frame = GuideFrame(
+                nodes=np.array(card.parameters["nodes"], dtype=np.float64),
+                anchors=np.array(card.parameters["anchors"], dtype=np.float64),
+            )
             self._long_side_px = int(card.parameters["searched_long_side_px"])
+            self._looks = int(card.parameters["looks"])
             self._weights = np.array(card.parameters["confidence"], dtype=np.float64)
         except (KeyError, TypeError, ValueError) as error:
             raise ModelUnavailable(f"The card of {card.name!r} is incomplete: {error!r}.", setting="model") from error
-        for positions in (self._nodes, self._anchors):
+        for positions in (self._frame.nodes, self._frame.anchors):
             if positions.ndim != 1 or len(positions) < 2 or not np.allclose(positions, -positions[::-1]):
                 raise ModelUnavailable(f"Nodes or anchors of {card.name!r} are not symmetric.", setting="model")
+        if self._weights.shape != (INPUTS,):
+            raise ModelUnavailable(f"The card of {card.name!r} needs {INPUTS} confidence weights.", setting="model")
         self._session = open_session(card.weights, threads)
         features = self._session.get_inputs()[0].shape
         values = self._session.get_outputs()[0].shape
-        if features[-1] != FEATURES or values[-1] != 2 * len(self._anchors) * len(self._nodes):
+        if features[-1] != FEATURES or values[-1] != self._frame.straight.size:
             raise ModelUnavailable(
                 f"The weights of {card.name!r} take {features} and give {values}, not what the card says.",
                 setting="model",
@@ -126,82 +136,60 @@ class LinesetEstimator:
         there are too few edges to say anything."""
         chains = extract(fit_long_side(grey, self._long_side_px))
         points = ChainPoints.of(chains)
-        direct, mirrored = describe(points), describe(points.mirrored())
-        slots = len(direct.features)
-        if slots < FEWEST_CHAINS:
+        extent = (chains.half_width, chains.half_height)
+        seen = self._look(points)
+        if seen is None:
             return Guides.straight(), None
-        pairs = [described.padded(slots) for described in (direct, mirrored)]
+        values = seen.values
+        displacement = self._displacement(values, extent)
+        if self._looks > 1 and displacement > SECOND_LOOK_FROM_PX:
+            values = self._second_look(points, values, extent)
+            displacement = self._displacement(values, extent)
+        evidence = Evidence(
+            expected_error=seen.expected_error,
+            displacement=displacement,
+            disagreement=self._frame.bend(seen.difference, *extent) * _PIXELS,
+            chains=seen.chains,
+        )
+        return self._frame.guides(values, *extent), evidence
+
+    def _displacement(self, values: Float64, extent: tuple[float, float]) -> float:
+        return self._frame.bend(values - self._frame.straight, *extent) * _PIXELS
+
+    def _look(self, points: ChainPoints) -> _Look | None:
+        """What the network says of chains and of their mirror image; None if there are too few."""
+        direct, reflected = describe(points), describe(points.mirrored())
+        slots = max(len(direct.features), len(reflected.features))
+        if slots < FEWEST_CHAINS:
+            return None
+        pairs = [described.padded(slots) for described in (direct, reflected)]
         values, spreads = self._session.run(
             ["nodes", "spreads"],
             {"features": np.concatenate([p[0] for p in pairs]), "mask": np.concatenate([p[1] for p in pairs])},
         )
-        shape = (2, len(self._anchors), len(self._nodes))
-        one = np.asarray(values[0], dtype=np.float64).reshape(shape)
-        other = mirrored_values(np.asarray(values[1], dtype=np.float64).reshape(shape))
-        mean = (one + other) / 2
-        evidence = self._evidence(mean, one - other, spreads, points.half_extent[0].astype(np.float64), slots)
-        guides = guides_from_isotropic(mean, self._nodes, self._anchors, chains.half_width, chains.half_height)
-        return guides, evidence
+        one, other = np.asarray(values, dtype=np.float64).reshape(2, *self._frame.straight.shape)
+        other = mirrored(other)
+        expected_error = float(np.exp(np.clip(np.asarray(spreads)[:, -1], -4, 5).mean()))
+        return _Look((one + other) / 2, (one - other) / 2, expected_error, len(direct.features))
 
-    def _evidence(
-        self, mean: Float64, difference: Float64, spreads: npt.NDArray[np.float32], half_extent: Float64, chains: int
-    ) -> Evidence:
-        straight = np.broadcast_to(self._anchors[:, None], mean[0].shape)
-        return Evidence(
-            expected_error=float(np.exp(np.clip(np.asarray(spreads)[:, -1], -4, 5).mean())),
-            displacement=self._bend(mean - straight, half_extent),
-            disagreement=self._bend(difference, half_extent) / 2,
-            chains=chains,
-        )
-
-    def _bend(self, offset: Float64, half_extent: Float64) -> float:
-        """Mean displacement, px, of what no infinitesimal homography explains of small node value offsets (2, K, d+1),
-        over a lattice of the picture."""
-        steps = np.linspace(-1, 1, _LATTICE)
-        x, y = (a.ravel() * h for a, h in zip(np.meshgrid(steps, steps), half_extent, strict=True))
-        down = np.einsum("nk,nd,kd->n", lagrange_basis(self._anchors, y), lagrange_basis(self._nodes, x), offset[0])
-        right = np.einsum("nk,nd,kd->n", lagrange_basis(self._anchors, x), lagrange_basis(self._nodes, y), offset[1])
-        one, zero = np.ones_like(x), np.zeros_like(x)
-        tangents = np.concatenate(
-            [
-                np.stack([one, zero, x, zero, y, zero, x * x, x * y], 1),
-                np.stack([zero, one, zero, x, zero, y, x * y, y * y], 1),
-            ]
-        )
-        moved = np.concatenate([right, down])
-        rest = moved - tangents @ np.linalg.lstsq(tangents, moved, rcond=None)[0]
-        return float(np.hypot(*rest.reshape(2, -1)).mean() * _PIXELS)
+    def _second_look(self, points: ChainPoints, values: Float64, extent: tuple[float, float]) -> Float64:
+        """The values after looking at the chains that `values` straighten; unchanged where that is of no use."""
+        s, t = self._frame.straightened(values, points.x.astype(np.float64), points.y.astype(np.float64))
+        inside = (np.abs(s) < _SECOND_LOOK_EXTENT * extent[0]) & (np.abs(t) < _SECOND_LOOK_EXTENT * extent[1])
+        rest = self._look(points.moved(s.astype(np.float32), t.astype(np.float32)).kept(inside))
+        if rest is None:
+            return values
+        try:
+            return self._frame.composed(values, rest.values, *extent)
+        except InvalidGuides:
+            return values
 
 
-def mirrored_values(values: Float64) -> Float64:
-    """Node values (2, K, degree + 1), isotropic frame, of the picture mirrored left to right.
+@dataclass(frozen=True, slots=True)
+class _Look:
+    """Mean of what the picture and its mirror image say, half their difference (2, K, degree + 1), and the rest."""
 
-    A row guide is run through backwards; a column guide lies as far from the other side, and the order of the columns
-    turns round. Nodes and anchors are symmetric about 0.
-    """
-    return np.stack([values[0][:, ::-1], -values[1][::-1]])
-
-
-def guides_from_isotropic(
-    values: Float64, nodes: Float64, anchors: Float64, half_width: float, half_height: float
-) -> Guides:
-    """Guides in the centred frame from node values in the isotropic frame; exact.
-
-    The isotropic guides define y = sum_k L_k(t) P_k(x) with L the Lagrange basis over the anchors; at the target
-    heights a h of the centred anchors a this is one polynomial each, to which x = w x_c and y = h y_c are applied.
-
-    Args:
-        values: (2, K, degree + 1) float64: ``values[0, i, k]`` is the y of row guide i at x = nodes[k],
-            ``values[1, j, k]`` the x of column guide j at y = nodes[k].
-        nodes: (degree + 1,) float64. anchors: (K,) float64. Both isotropic, symmetric about 0.
-        half_width, half_height: of the picture in the isotropic frame, w and h above.
-
-    Raises:
-        InvalidGuides: values that are not finite or far outside the picture.
-    """
-    powers = np.vander(nodes, increasing=True)
-    coefficients = np.linalg.solve(powers, values.transpose(0, 2, 1)).transpose(0, 2, 1)
-    exponents = np.arange(len(nodes))
-    rows = lagrange_basis(anchors, anchors * half_height) @ coefficients[0] * half_width**exponents / half_height
-    columns = lagrange_basis(anchors, anchors * half_width) @ coefficients[1] * half_height**exponents / half_width
-    return Guides(GuideFamily(anchors, rows), GuideFamily(anchors, columns))
+    values: Float64
+    difference: Float64
+    expected_error: float
+    chains: int
