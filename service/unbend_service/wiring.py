@@ -31,6 +31,13 @@ def build_store(settings: Settings) -> GridStore:
     return MemoryGridStore(settings)
 
 
+def build_exchange() -> Exchange:
+    """Grids to and from files alone, for commands: no model is loaded and no worker started."""
+    meter = PrometheusMeter()
+    blocking = BlockingWork(1, 8, meter)
+    return Exchange(ExchangeFiles(), FittedGrids(blocking, meter), blocking)
+
+
 def build_service(settings: Settings, meter: PrometheusMeter | None = None) -> Service:
     """The whole application, not yet started.
 
@@ -53,6 +60,7 @@ def build_service(settings: Settings, meter: PrometheusMeter | None = None) -> S
         meter,
         grid_points=settings.grid_points,
         min_confidence=settings.min_confidence,
+        known_images=settings.known_images,
     )
     correction = Correction(
         estimation,
