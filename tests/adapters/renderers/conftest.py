@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import os
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -20,13 +21,14 @@ def worker_processes() -> list[psutil.Process]:
     """Render workers that live."""
     return [
         child
-        for child in psutil.Process().children(recursive=True)
+        for child in psutil.Process().children()
         if child.status() != psutil.STATUS_ZOMBIE and any("renderers.worker" in part for part in child.cmdline())
     ]
 
 
 def slot_descriptors() -> int:
     """Descriptors of shared memory for frames that this process holds."""
+    gc.collect()  # an error and the frames of its traceback may hold answers in a circle
     links = []
     for name in os.listdir("/proc/self/fd"):
         try:
