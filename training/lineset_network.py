@@ -38,7 +38,7 @@ class NetworkShape:
     queries: int = 16
     global_width: int = 256
     rounds: int = 3
-    refinements: int = 2
+    refinements: int = 0
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)

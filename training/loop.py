@@ -23,6 +23,7 @@ from training.lineset_network import Layout, LinesetNetwork, NetworkShape
 from training.losses import Truth, spread_loss, tempered
 from training.random_distortions import KINDS
 from training.sampler import Sampler, TrainingBatch
+from training.second_look import second_look
 from training.warm_start import inherit
 from unbend_service.adapters.estimators.chain_features import FEATURES
 
@@ -32,7 +33,11 @@ REPORT_EVERY_S = 30.0
 
 @dataclass(frozen=True)
 class Recipe:
-    """How a run learns. `nonlinear_weight` against 1 for the error of all: lenses first, pose second."""
+    """How a run learns.
+
+    nonlinear_weight: against 1 for the error of all: lenses first, pose second.
+    second_look_every: so many batches are followed by a second look at one of them; 0 for never.
+    """
 
     batch_size: int = 128
     learning_rate: float = 7.0e-4
@@ -42,6 +47,7 @@ class Recipe:
     nonlinear_weight: float = 2.5
     gradient_limit: float = 20.0
     bfloat16: bool = True
+    second_look_every: int = 2
 
 
 def new_checkpoint(sampler: Sampler, shape: NetworkShape, seed: int, inherit_from: Path | None = None) -> Checkpoint:
@@ -77,6 +83,17 @@ def _principal_basis(labels: np.ndarray[Any, Any]) -> Tensor:
     return torch.tensor(vectors * np.sqrt(np.maximum(values, 0.008**2)), dtype=torch.float32)
 
 
+@dataclass(frozen=True)
+class Lesson:
+    """What a step saw before it learned: node values (B, 72), errors of all and of the nonlinear part (B,), px, and
+    the loss of the spreads."""
+
+    values: Tensor
+    overall: Tensor
+    nonlinear: Tensor
+    spread: float
+
+
 class Run:
     """A training run in memory."""
 
@@ -99,6 +116,7 @@ class Run:
             self.optimiser.load_state_dict(checkpoint.optimiser)
         self.generator = checkpoint.restored_generator()
         self.step, self.samples = checkpoint.step, checkpoint.samples
+        self.batches = int(checkpoint.notes.get("batches", 0))
         self.seconds, self.notes = checkpoint.seconds, dict(checkpoint.notes)
         self.inverse_basis = torch.linalg.inv(self.network.basis)
         self.warm_until = self.step + recipe.warmup_steps
@@ -113,11 +131,11 @@ class Run:
             step=self.step,
             samples=self.samples,
             seconds=self.seconds,
-            notes=self.notes,
+            notes={**self.notes, "batches": self.batches},
         )
 
-    def learn(self, batch: TrainingBatch, rate_scale: float = 1.0) -> tuple[Tensor, Tensor, float]:
-        """One step; returns each sample's errors (all, nonlinear; px) and the spread loss."""
+    def learn(self, batch: TrainingBatch, rate_scale: float = 1.0) -> Lesson:
+        """One step."""
         warm = min(1.0, 0.02 + 1 - (self.warm_until - self.step) / max(self.recipe.warmup_steps, 1))
         for group in self.optimiser.param_groups:
             group["lr"] = self.recipe.learning_rate * rate_scale * warm
@@ -137,11 +155,14 @@ class Run:
         torch.nn.utils.clip_grad_norm_(self.parameters, self.recipe.gradient_limit)
         self.optimiser.step()
         self.step += 1
-        self.samples += len(batch.kind)
         decay = min(self.recipe.average_decay, (1 + self.step) / (20 + self.step))
         with torch.no_grad():
             torch._foreach_lerp_(list(self.average.parameters()), self.parameters, 1 - decay)
-        return overall.detach(), nonlinear.detach(), float(spread.detach())
+        return Lesson(values.detach(), overall.detach(), nonlinear.detach(), float(spread.detach()))
+
+    def learn_again(self, batch: TrainingBatch, values: Tensor, rate_scale: float = 1.0) -> Lesson:
+        """A step on the second look at a batch whose first look gave `values`."""
+        return self.learn(second_look(batch, values, self.network.straightening), rate_scale)
 
 
 def packed_input(batch: TrainingBatch) -> tuple[Tensor, Layout]:
@@ -161,10 +182,13 @@ class Progress:
         self._log = log
         self._overall: dict[int, list[float]] = defaultdict(list)
         self._nonlinear: dict[int, list[float]] = defaultdict(list)
+        self._looks: list[tuple[float, float]] = []
         self.last = time.monotonic()
 
-    def note(self, batch: TrainingBatch, overall: Tensor, nonlinear: Tensor) -> None:
-        for kind, a, b in zip(batch.kind.tolist(), overall.tolist(), nonlinear.tolist(), strict=True):
+    def note(self, batch: TrainingBatch, lesson: Lesson, again: Lesson | None) -> None:
+        if again is not None:
+            self._looks.append((float(lesson.nonlinear.mean()), float(again.nonlinear.mean())))
+        for kind, a, b in zip(batch.kind.tolist(), lesson.overall.tolist(), lesson.nonlinear.tolist(), strict=True):
             self._overall[kind].append(a)
             self._nonlinear[kind].append(b)
 
@@ -178,6 +202,7 @@ class Progress:
             "epe": round(float(np.mean(everything)), 3),
             "nonlinear": round(float(np.mean(bent)), 4),
             "nonlinear_median": round(float(np.median(bent)), 4),
+            "looks": [round(float(a), 4) for a in np.mean(self._looks, 0)] if self._looks else [],
             **{name: round(value, 5) for name, value in more.items()},
             "by_kind": {
                 KINDS[k]: [round(float(np.mean(self._overall[k])), 2), round(float(np.mean(v)), 3)]
@@ -189,6 +214,7 @@ class Progress:
         print(json.dumps(line), flush=True)
         self._overall.clear()
         self._nonlinear.clear()
+        self._looks.clear()
         self.last = time.monotonic()
 
 
@@ -220,24 +246,29 @@ def train(
     previous = {s: signal.signal(s, stop) for s in (signal.SIGTERM, signal.SIGINT)}
     path = directory / f"{name}.pt"
     progress = Progress(directory / f"{name}.jsonl")
-    began, saved, drawing_s, first_step, spread = time.monotonic(), time.monotonic(), 0.0, run.step, 0.0
+    began, saved, drawing_s, first_batch = time.monotonic(), time.monotonic(), 0.0, run.batches
     before, reported_samples = run.seconds, run.samples
     while not stop.asked:
         elapsed = time.monotonic() - began
-        done = max(elapsed / 60 / minutes if minutes else 0.0, (run.step - first_step) / steps if steps else 0.0)
+        done = max(elapsed / 60 / minutes if minutes else 0.0, (run.batches - first_batch) / steps if steps else 0.0)
         if done >= 1:
             break
         start = time.monotonic()
         batch = sampler.draw(run.recipe.batch_size, run.generator)
         drawing_s += time.monotonic() - start
-        overall, nonlinear, spread = run.learn(batch, rate_scale=max(1 - done, 0.0) if cooling else 1.0)
+        rate = max(1 - done, 0.0) if cooling else 1.0
+        lesson, again = run.learn(batch, rate), None
+        run.samples += len(batch.kind)
+        run.batches += 1
+        if run.recipe.second_look_every and run.batches % run.recipe.second_look_every == 0:
+            again = run.learn_again(batch, lesson.values, rate)
         run.seconds = before + time.monotonic() - began
-        progress.note(batch, overall, nonlinear)
+        progress.note(batch, lesson, again)
         if time.monotonic() - progress.last > REPORT_EVERY_S:
             interval = time.monotonic() - progress.last
             progress.report(
                 run,
-                spread=spread,
+                spread=lesson.spread,
                 drawing=drawing_s / (time.monotonic() - began),
                 samples_per_s=(run.samples - reported_samples) / interval,
             )

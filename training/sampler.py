@@ -41,13 +41,14 @@ _BBOX_REACH = 1.9
 class TrainingBatch:
     """One batch.
 
-    chains: the network's input. source, target: float32 (B, n, 2), correspondences in the isotropic frame; weight:
-    float32 (B, n). slopes: float32 (B, n, 2, 2), d source / d target. labels: float32 (L, 72),
-    fitted node values of the first L = B / LABELLED_SHARE samples.
+    chains: the network's input, descriptions of points. source, target: float32 (B, n, 2), correspondences in the
+    isotropic frame; weight: float32 (B, n). slopes: float32 (B, n, 2, 2), d source / d target. labels: float32
+    (L, 72), fitted node values of the first L = B / LABELLED_SHARE samples.
     kind: int (B,) index into random_distortions.KINDS.
     """
 
     chains: ChainDescriptions
+    points: ChainPoints
     source: Float32
     target: Float32
     weight: Float32
@@ -103,6 +104,7 @@ class Sampler:
         target = np.stack([target_x, target_y], -1).clip(-3, 3)
         return TrainingBatch(
             chains=describe(points),
+            points=points,
             source=np.stack([source_x, source_y], -1).astype(np.float32),
             target=target.astype(np.float32),
             weight=weight.astype(np.float32),

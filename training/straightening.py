@@ -62,9 +62,7 @@ class Straightening(nn.Module):
         coefficients of these, corrected by what all points of the chain say beyond the samples; its direction.
         """
         x, y = features[..., :SAMPLES], features[..., SAMPLES : 2 * SAMPLES]
-        half = curves.shape[-1] // 2
-        t = self._target(curves[..., :half], x, y)
-        s = self._target(curves[..., half:], y, x)
+        s, t = self.straightened(curves, x, y)
         offset, cos, sin = _across(s, t)
         before, _, _ = _across(x, y)
         fitted = offset @ self.legendre
@@ -74,6 +72,11 @@ class Straightening(nn.Module):
         deviation = torch.where(cos.abs() >= sin.abs(), sin / cos.clamp(min=0.5), -cos / sin.abs().clamp(min=0.5))
         direction = torch.cat([2 * cos * cos - 1, 2 * sin * cos, horizontal, _asinh(deviation * (90 / math.pi))], -1)
         return torch.cat([_asinh(offset / 0.5), _asinh(bend / 0.3), _asinh(bend / 0.05) / 3, direction], -1)
+
+    def straightened(self, curves: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Target coordinates s, t (..., n) of source points x, y (..., n) under curves (..., 72)."""
+        half = curves.shape[-1] // 2
+        return self._target(curves[..., half:], y, x), self._target(curves[..., :half], x, y)
 
     def _target(self, monomials: Tensor, along: Tensor, across: Tensor) -> Tensor:
         """Target coordinate of points: solves sum_k sum_d m_kd t^k along^d = across for t by Newton's method.
