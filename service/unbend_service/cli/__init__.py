@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import typer
 
+from unbend_service.cli.annotate import annotate
 from unbend_service.cli.correct import correct
 from unbend_service.cli.doctor import doctor
 from unbend_service.cli.estimate import estimate
+from unbend_service.cli.grid import grid
 from unbend_service.cli.serve import serve
 
 app = typer.Typer(
@@ -16,8 +18,9 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for verb in (serve, correct, estimate, doctor):
+for verb in (serve, correct, estimate, annotate, doctor):
     app.command()(verb)
+app.add_typer(grid)
 
 
 def main() -> None:
