@@ -270,6 +270,8 @@ async def test_closing_finishes_what_was_accepted(make_pool: MakePool) -> None:
         np.testing.assert_array_equal(answer, expected(frame(misbehaving.SLEEP)))
     await closing
     assert worker_processes() == []
+    accepted.clear()
+    del answer  # until then it lies in shared memory
     assert slot_descriptors() == 0
 
 

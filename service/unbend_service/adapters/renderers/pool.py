@@ -12,6 +12,7 @@ from unbend_service.adapters.cores import usable_cores
 from unbend_service.adapters.renderers.channel import Done, Failed
 from unbend_service.adapters.renderers.copies import Copies
 from unbend_service.adapters.renderers.jobs import Job, JobQueue, preferred_worker
+from unbend_service.adapters.renderers.leases import Lending
 from unbend_service.adapters.renderers.selection import RendererOptions
 from unbend_service.adapters.renderers.slots import SlotPool
 from unbend_service.adapters.renderers.supervision import Supervisor
@@ -43,8 +44,10 @@ class WorkerPool:
     """Renders frames in worker processes; implements :class:`~unbend_service.application.ports.RenderPool`.
 
     All of it runs on one event loop. A frame waits in the queue, is copied into shared memory when a worker can take
-    it, and stays there until it is answered, so a frame whose worker dies is given to another. Cost of a frame beyond
-    its rendering: two copies of its bytes and two short messages.
+    it, and stays there until it is answered, so a frame whose worker dies is given to another. The answer stays in
+    shared memory too, lent to the caller until he lets go of it; only when answers that nobody lets go of would take
+    more than half of the memory are they copied out. Cost of a frame beyond its rendering: one copy of its bytes and
+    two short messages.
 
     Args:
         settings: workers, slots_per_worker, shared_memory_bytes, queue_frames, render_deadline_s, renderer,
@@ -57,6 +60,7 @@ class WorkerPool:
         self._settings = settings
         self._meter = meter
         self._slots = SlotPool(settings.shared_memory_bytes)
+        self._lending = Lending(self._slots, settings.shared_memory_bytes // 2, self._dispatch)
         self._queue = JobQueue()
         self._jobs: set[Job] = set()
         self._accepted = 0
@@ -283,6 +287,14 @@ class WorkerPool:
         if job.answer.done() or job.slot is None:
             self._finish(job)
             return
+        drawn = job.slot.memory[job.size_bytes : 2 * job.size_bytes]
+        lent = self._lending.lend(job.slot, job.size_bytes, 2 * job.size_bytes)
+        if lent is not None:
+            job.slot = None
+            job.answer.set_result(lent)
+            self._finish(job)
+            self._dispatch()
+            return
         result = np.empty(job.size_bytes, np.uint8)
 
         def copied() -> None:
@@ -291,7 +303,7 @@ class WorkerPool:
             self._finish(job)
             self._dispatch()
 
-        self._copies.copy(result, job.slot.memory[job.size_bytes : 2 * job.size_bytes], copied)
+        self._copies.copy(result, drawn, copied)
 
     def _finish(self, job: Job) -> None:
         """The pool is done with the job; its slot is free for the next."""

@@ -60,6 +60,7 @@ class Slot:
         del self.memory
         with suppress(BufferError):
             self._map.close()
+        del self._map  # it keeps a descriptor of its own
         os.close(self.fd)
 
 
@@ -77,6 +78,7 @@ class SlotPool:
         self._made = 0
         self._dropped: list[int] = []
         self.size_bytes = 0
+        self.closed = False
 
     @property
     def used(self) -> int:
@@ -125,7 +127,8 @@ class SlotPool:
         return dropped
 
     def close(self) -> None:
-        """Frees everything, also what is in use."""
+        """Frees everything, also what is in use; memory that somebody still looks at goes with the last look."""
+        self.closed = True
         for slot in (*self._free.values(), *self._used.values()):
             self._drop(slot)
         self._free.clear()
