@@ -1,4 +1,4 @@
-"""Encoded images with Pillow: libjpeg-turbo, zlib-ng and libwebp behind one interface.
+"""Encoded images with Pillow: libjpeg-turbo, zlib-ng and libwebp behind one interface. Plain JPEGs go past it (jpegs).
 
 What is read becomes 8-bit gray8, rgb24 or rgba. 16-bit samples lose their lower half; CMYK becomes sRGB, by its ICC
 profile where it has one; palettes and transparent colours are resolved. An ICC profile is kept only if it still
@@ -24,6 +24,7 @@ from PIL.TiffImagePlugin import TiffImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
 from unbend_service.adapters.codecs import exif
+from unbend_service.adapters.codecs.jpegs import decode_rgb, encode_packed
 from unbend_service.adapters.codecs.signatures import announced_size, sniff
 from unbend_service.application.ports import Bytes, DecodedImage, ImageHeader
 from unbend_service.domain.errors import InvalidFrame, InvalidImage, InvalidOption, TooManyPixels, UnbendError
@@ -50,6 +51,7 @@ _UPRIGHT = {
     8: Image.Transpose.ROTATE_90,
 }
 _PIXEL_FORMATS = {"L": PixelFormat.GRAY8, "RGB": PixelFormat.RGB24, "RGBA": PixelFormat.RGBA}
+_MODES = {pixel_format: mode for mode, pixel_format in _PIXEL_FORMATS.items()}
 _RAW_MODES = {
     PixelFormat.GRAY8: ("L", "L"),
     PixelFormat.RGB24: ("RGB", "RGB"),
@@ -57,11 +59,13 @@ _RAW_MODES = {
     PixelFormat.RGBA: ("RGBA", "RGBA"),
     PixelFormat.BGRA: ("RGBA", "BGRA"),
 }
+_PACKED_ORDERS = {PixelFormat.RGB24: "RGB", PixelFormat.BGR24: "BGR"}
 _PROFILE_SPACES = {"L": b"GRAY", "RGB": b"RGB ", "RGBA": b"RGB "}
 _LONGEST_SIDE_PX = {"jpeg": 65_500, "png": 2**31 - 1, "webp": 16_383}
 _MAX_JPEG_EXIF_BYTES = 65_533 - 6
 # A reduced decode averages over whole blocks, and the padding of the last block shows in a picture that is only thin.
 _SHORTEST_DRAFT_PX = 64
+_SUBSAMPLING = "4:2:0"
 _WHITE = (255, 255, 255)
 
 
@@ -87,20 +91,25 @@ class PillowCodec:
         image_format = sniff(body)
         image = self._open(body, image_format)
         with _translated(image_format):
-            image.load()
+            pixels = decode_rgb(body) if image_format == "jpeg" and image.mode == "RGB" else None
+            if pixels is None:
+                image.load()
             # TIFF is turned upright by its plugin, and its EXIF block is the file itself
             block = exif.bare(image.info.get("exif") or b"") if image_format != "tiff" else b""
             method = _UPRIGHT.get(exif.orientation(block))
             profile = image.info.get("icc_profile") or None
-            plain = _plain(image, profile)
-            if method is not None:
-                plain = plain.transpose(method)
-            frame = Frame(_PIXEL_FORMATS[plain.mode], plain.width, plain.height, np.asarray(plain).reshape(-1))
+            if pixels is not None and method is None:
+                frame = Frame(PixelFormat.RGB24, image.width, image.height, pixels.reshape(-1))
+            else:
+                plain = _plain(image, profile) if pixels is None else Image.fromarray(pixels)
+                if method is not None:
+                    plain = plain.transpose(method)
+                frame = Frame(_PIXEL_FORMATS[plain.mode], plain.width, plain.height, np.asarray(plain).reshape(-1))
         return DecodedImage(
             frame,
             image_format,
             exif=(exif.upright(block) if block else None),
-            icc_profile=profile if _describes(profile, plain.mode) else None,
+            icc_profile=profile if _describes(profile, _MODES[frame.pixel_format]) else None,
             upright=method is None,
             chroma_subsampling=_subsampling(image),
         )
@@ -143,6 +152,8 @@ class PillowCodec:
                 f"A picture of {image.frame.width}x{image.frame.height} pixels does not fit into {image_format}.",
                 allowed=f"{_LONGEST_SIDE_PX[image_format]} pixels a side, or png",
             )
+        if image_format == "jpeg" and image.frame.pixel_format in _PACKED_ORDERS:
+            return _encode_packed(image, quality)
         picture = _picture(image.frame)
         if image_format == "jpeg":
             picture = _flat(picture)
@@ -256,6 +267,15 @@ def _picture(frame: Frame) -> Image.Image:
     return Image.frombuffer(mode, (frame.width, frame.height), data, "raw", raw_mode, 0, 1)
 
 
+def _encode_packed(image: DecodedImage, quality: int) -> bytes:
+    metadata = _metadata(image, "jpeg", "RGB")
+    frame = image.frame
+    pixels = np.ascontiguousarray(frame.data).reshape(frame.height, frame.width, 3)
+    order = _PACKED_ORDERS[frame.pixel_format]
+    subsampling = image.chroma_subsampling or _SUBSAMPLING
+    return encode_packed(pixels, order, quality, subsampling, metadata.get("exif"), metadata.get("icc_profile"))
+
+
 def _metadata(image: DecodedImage, image_format: str, mode: str) -> dict[str, bytes]:
     metadata = {}
     if image.icc_profile is not None and _describes(image.icc_profile, mode):
@@ -267,7 +287,7 @@ def _metadata(image: DecodedImage, image_format: str, mode: str) -> dict[str, by
 
 def _options(image: DecodedImage, image_format: str, quality: int) -> dict[str, object]:
     if image_format == "jpeg":
-        return {"quality": quality, "subsampling": image.chroma_subsampling or "4:2:0"}
+        return {"quality": quality, "subsampling": image.chroma_subsampling or _SUBSAMPLING}
     if image_format == "webp":
         return {"quality": quality, "method": 2}
     # run lengths only: on photographs half the time of the default for a few per cent of size
