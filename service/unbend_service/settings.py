@@ -37,6 +37,9 @@ class Settings(BaseSettings):
 
     model: str = Field("first", description="Estimator: the name of a model that ships, or a path to one.")
     estimator_threads: int = Field(0, ge=0, le=256, description="Threads of one estimate; 0: as many as usable cores.")
+    known_images: int = Field(
+        1024, ge=0, description="Pictures whose estimate is kept, so that the same picture is not looked at twice."
+    )
     min_confidence: float = Field(
         0.0, ge=0, le=1, description="Below this confidence a picture is left alone, unless the request says otherwise."
     )

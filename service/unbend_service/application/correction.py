@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from unbend_service.application.blocking import BlockingWork
-from unbend_service.application.estimation import ESTIMATE_LONGEST_PX, Estimation
+from unbend_service.application.estimation import Estimation
 from unbend_service.application.fitting import FittedGrids
-from unbend_service.application.grey import grey_of_frame
 from unbend_service.application.ports import Bytes, DecodedImage, GridStore, ImageCodec, Meter, RenderPool
 from unbend_service.domain.errors import InvalidOption, UnbendError
 from unbend_service.domain.fit import CROP, Fit
@@ -161,9 +160,7 @@ class Correction:
     async def _record(self, frame: Frame, options: CorrectOptions) -> GridRecord:
         if options.grid_id is not None:
             return await self._store.get(options.grid_id)
-        grey = await self._blocking.run("decode", grey_of_frame, frame, ESTIMATE_LONGEST_PX)
-        estimate = await self._estimation.of_grey(grey)
-        return await self._estimation.record(estimate, options.correct, options.min_confidence)
+        return await self._estimation.of_frame(frame, options.correct, min_confidence=options.min_confidence)
 
 
 def leaves_alone(record: GridRecord) -> bool:

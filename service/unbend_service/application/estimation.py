@@ -7,6 +7,7 @@ import dataclasses
 from unbend_service.application.blocking import BlockingWork
 from unbend_service.application.fitting import FittedGrids
 from unbend_service.application.grey import grey_of_frame
+from unbend_service.application.known import HASHED_AT_ONCE_BYTES, Known, digest
 from unbend_service.application.ports import Bytes, Estimate, Estimator, GridStore, ImageCodec, Meter
 from unbend_service.domain.decision import decide
 from unbend_service.domain.errors import InvalidOption
@@ -26,7 +27,13 @@ def check_confidence(min_confidence: float) -> float:
 
 
 class Estimation:
-    """Runs the estimator off the event loop, decides, and stores what was decided."""
+    """Runs the estimator off the event loop, decides, and stores what was decided.
+
+    A picture that was seen before, or is being looked at, is not looked at again.
+
+    Args:
+        known_images: pictures whose estimate is kept.
+    """
 
     def __init__(
         self,
@@ -39,7 +46,9 @@ class Estimation:
         *,
         grid_points: int,
         min_confidence: float,
+        known_images: int = 1024,
     ) -> None:
+        self._known: Known[Estimate] = Known(known_images)
         self._estimator = estimator
         self._codec = codec
         self._store = store
@@ -84,8 +93,14 @@ class Estimation:
         Raises:
             EmptyBody, UnsupportedMediaType, InvalidImage, TooManyPixels, InvalidOption, QueueFull.
         """
-        grey = await self._blocking.run("decode", self._codec.decode_grey, body, ESTIMATE_LONGEST_PX)
-        return await self.of_grey_described(grey, correct, fit, strength, min_confidence)
+
+        async def look() -> Estimate:
+            return await self.of_grey(
+                await self._blocking.run("decode", self._codec.decode_grey, body, ESTIMATE_LONGEST_PX)
+            )
+
+        estimate = await self._known.get(await self._digest(body), look)
+        return await self._described(estimate, correct, fit, strength, min_confidence)
 
     async def of_frame(
         self,
@@ -96,14 +111,23 @@ class Estimation:
         min_confidence: float | None = None,
     ) -> GridRecord:
         """As :meth:`of_image`, for a raw picture."""
-        grey = await self._blocking.run("decode", grey_of_frame, frame, ESTIMATE_LONGEST_PX)
-        return await self.of_grey_described(grey, correct, fit, strength, min_confidence)
+        layout = f"{frame.pixel_format} {frame.width} {frame.height}".encode()
 
-    async def of_grey_described(
-        self, grey: Bytes, correct: Correct, fit: Fit, strength: float, min_confidence: float | None
+        async def look() -> Estimate:
+            return await self.of_grey(await self._blocking.run("decode", grey_of_frame, frame, ESTIMATE_LONGEST_PX))
+
+        estimate = await self._known.get(await self._digest(layout, frame.data), look)
+        return await self._described(estimate, correct, fit, strength, min_confidence)
+
+    async def _digest(self, *parts: bytes | Bytes) -> bytes:
+        if sum(len(part) for part in parts) <= HASHED_AT_ONCE_BYTES:
+            return digest(*parts)
+        return await self._blocking.run("decode", digest, *parts)
+
+    async def _described(
+        self, estimate: Estimate, correct: Correct, fit: Fit, strength: float, min_confidence: float | None
     ) -> GridRecord:
-        """As :meth:`of_image`, for a (height, width) uint8 picture."""
-        record = await self.record(await self.of_grey(grey), correct, min_confidence)
+        record = await self.record(estimate, correct, min_confidence)
         grid = await self._grids.get(record.grid, fit, strength)
         if grid is record.grid:
             return record
