@@ -4,16 +4,29 @@ from __future__ import annotations
 
 import argparse
 import sys
+from pathlib import Path
 
-from benchmarks import parity
+from benchmarks import parity, render
+
+SUITES = {"render": render}
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     suites = parser.add_subparsers(dest="suite", required=True)
     parity.add_arguments(suites.add_parser("parity", help=parity.__doc__))
+    for name, suite in SUITES.items():
+        options = suites.add_parser(name, help=suite.__doc__)
+        options.add_argument("--json", type=Path, help="file for the results")
+        options.add_argument("--quick", action="store_true", help="few turns: shows that it runs, measures nothing")
+        suite.add_arguments(options)
     arguments = parser.parse_args()
-    return parity.run(arguments)
+    if arguments.suite == "parity":
+        return parity.run(arguments)
+    report = SUITES[arguments.suite].run(arguments)
+    if arguments.json is not None:
+        report.write(arguments.json)
+    return 0 if report.ok or arguments.quick else 1
 
 
 if __name__ == "__main__":

@@ -48,13 +48,20 @@ class Pair:
     peer: Timing
     ratio: float
 
+    def per(self, parts: int) -> Pair:
+        """The same for one of ``parts`` equal parts of what was timed."""
+        first, second = (
+            Timing(whole.median_s / parts, whole.iqr_s / parts, whole.runs) for whole in (self.ours, self.peer)
+        )
+        return Pair(first, second, self.ratio)
+
 
 def by_turns(ours: Callable[[], object], peer: Callable[[], object], runs: int, warm_up: int = 3) -> Pair:
     """Times both alternately, after ``warm_up`` turns that do not count."""
     timed: list[tuple[float, float]] = []
     for turn in range(warm_up + runs):
         order = (ours, peer) if turn % 2 else (peer, ours)
-        spent = {}
+        spent: dict[Callable[[], object], float] = {}
         for function in order:
             start = time.perf_counter()
             function()
