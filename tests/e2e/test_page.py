@@ -192,6 +192,9 @@ def test_a_file_that_is_no_picture_is_refused_with_a_sentence(
     shoot(page, "refused")
     open_picture(page, facade)
     assert page.is_hidden("#error")
+    page.set_input_files("#file", text)
+    page.wait_for_selector("#refused:not([hidden])")
+    assert page.is_visible("#work"), "the picture at work stays"
 
 
 def test_everything_can_be_done_from_the_keyboard(service: Server, visit: Visit) -> None:
@@ -250,7 +253,7 @@ def test_guides_that_fold_the_picture_are_refused_at_once(service: Server, visit
     page.click("#adjust")
     settle(page)
     drag_guide(page, (0, 500))
-    assert "fold" in page.inner_text("#fold") or "of the estimate is applied" in page.inner_text("#why")
+    assert "fold" in page.inner_text("#fold") or "of the correction is applied" in page.inner_text("#why")
     page.click("#reset")
     settle(page)
     assert page.is_hidden("#fold")

@@ -14,16 +14,26 @@ export function withStrength(lattice, strength) {
   return new Lattice(lattice.rows, lattice.columns, target.map((at, i) => at + strength * (lattice.source[i] - at)));
 }
 
+/** Windows depend on the lattice alone: another fit of the same one costs nothing. */
+const windows = new WeakMap();
+
+function searched(lattice) {
+  let found = windows.get(lattice);
+  if (!found) windows.set(lattice, (found = { search: new WindowSearch(lattice) }));
+  return found;
+}
+
 /**
  * @param {number | null} zoomOut null keeps the frame; 0 crops; 1 shows every source pixel.
  * @returns {{lattice: Lattice, window: {x: number, y: number, half: number}}}
  */
 export function withFit(lattice, zoomOut) {
   if (zoomOut === null || lattice.isIdentity) return { lattice, window: WHOLE };
-  const target = targetLattice(lattice.rows, lattice.columns), search = new WindowSearch(lattice);
-  const crop = search.crop(), cropped = withoutGaps(lattice, crop, target);
+  const target = targetLattice(lattice.rows, lattice.columns), found = searched(lattice);
+  const crop = (found.crop ??= found.search.crop());
+  const cropped = (found.cropped ??= withoutGaps(lattice, crop, target));
   if (zoomOut === 0) return cropped;
-  const full = search.full();
+  const full = (found.full ??= found.search.full());
   for (let share = zoomOut; share > 0.01; share *= 0.9) {
     const window = towards(crop, full, share), source = shown(lattice, window, target);
     if (foldedShare(source, lattice.rows, lattice.columns) === 0) {

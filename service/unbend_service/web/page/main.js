@@ -28,7 +28,7 @@ let attempt = 0;
 
 async function accept(file) {
   const mine = ++attempt;
-  get("error").hidden = true;
+  get("error").hidden = get("refused").hidden = true;
   phase("working");
   progress("Reading the picture…", null);
   try {
@@ -45,11 +45,13 @@ async function accept(file) {
   }
 }
 
+/** A picture that is at work already stays. */
 function refuse(error) {
-  phase("empty");
-  get("error").textContent = error.message;
-  get("error").hidden = false;
-  get("choose").focus();
+  phase(state.picture ? "ready" : "empty");
+  const place = get(state.picture ? "refused" : "error");
+  place.textContent = error.message;
+  place.hidden = false;
+  get(state.picture ? "another" : "choose").focus();
 }
 
 function progress(text, share) {
@@ -110,7 +112,7 @@ function control(derived) {
   setText("strength-value", `${Math.round(state.strength * 100)} %`);
   get("fit").disabled = state.fit === null;
   if (state.fit !== null) get("fit").value = Math.round(state.fit * 100);
-  setText("fit-value", state.fit === null ? "as estimated" : { 0: "cropped", 1: "everything" }[state.fit] ?? `${Math.round(state.fit * 100)} % wider`);
+  setText("fit-value", state.fit === null ? "as estimated" : { 0: "cropped", 1: "everything" }[state.fit] ?? `${Math.round(state.fit * 100)} %`);
   get("keep").checked = state.fit === null;
   get("all").checked = state.correct === "all";
   get("all").disabled = !state.guides;
@@ -176,6 +178,18 @@ async function save() {
   }));
   update({ saved: { id, lattice: blended } });
   announce(`Saved as the grid ${id}`);
+  requestAnimationFrame(() => get("saved").scrollIntoView({ block: "nearest" }));
+}
+
+/** Copies the text of an element; over plain HTTP, where pages may not, it is selected instead. */
+async function copied(source) {
+  try {
+    await navigator.clipboard.writeText(source.textContent);
+    return true;
+  } catch {
+    getSelection().selectAllChildren(source);
+    return false;
+  }
 }
 
 /** Into the adjusting view, the focus on a control point; and back, the focus where it came from. */
@@ -191,7 +205,7 @@ function adjust(adjusting) {
 const on = (id, event, act) => get(id).addEventListener(event, act);
 on("choose", "click", () => get("file").click());
 on("file", "change", (event) => { if (event.target.files[0]) accept(event.target.files[0]); event.target.value = ""; });
-on("another", "click", () => { attempt++; phase("empty"); get("choose").focus(); });
+on("another", "click", () => { attempt++; phase("empty"); state.picture = null; get("choose").focus(); });
 for (const button of document.querySelectorAll("[data-sample]")) {
   button.addEventListener("click", () => sample(button.dataset.sample).then(accept, refuse));
 }
@@ -214,8 +228,7 @@ on("download", "click", (event) => busy(event.target, "Rendering at full size…
 on("save", "click", (event) => busy(event.target, "Saving…", save));
 for (const button of document.querySelectorAll("[data-copy]")) {
   button.addEventListener("click", async () => {
-    await navigator.clipboard.writeText(get(button.dataset.copy).textContent);
-    button.textContent = "Copied";
+    button.textContent = (await copied(get(button.dataset.copy))) ? "Copied" : "Selected";
     setTimeout(() => { button.textContent = "Copy"; }, 1500);
   });
 }

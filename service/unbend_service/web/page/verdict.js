@@ -17,16 +17,14 @@ const ALONE = {
 /** @returns {{title: string, sentence: string}} */
 export function verdict(state, derived) {
   const { record } = state;
-  if (state.edited) {
-    return { title: "Straightened by hand", sentence: "The picture follows your guides." };
-  }
+  const weaker = derived.weakened < 1 ? ` Only ${percent(derived.weakened)} of the correction is applied; more would fold the picture.` : "";
+  if (state.edited) return { title: "Straightened by hand", sentence: `The picture follows your guides.${weaker}` };
   if (record.outcome === "left_alone" && !state.anyway) {
     const [title, sentence] = ALONE[record.reason] ?? ["Left as it is", () => "Nothing was changed."];
     return { title, sentence: sentence(record) };
   }
   const moved = (derived.blended.displacement * state.picture.width) / 2;
   const moves = `On average a point moves by ${moved < 10 ? moved.toFixed(1) : Math.round(moved)}\u00a0pixels.`;
-  const weaker = derived.weakened < 1 ? ` Only ${percent(derived.weakened)} of the estimate is applied; more would fold the picture.` : "";
   if (state.anyway) return { title: "Corrected at your word", sentence: `${moves} The service itself would have left the picture alone.` };
   return { title: "Straightened", sentence: `${moves} ${trust(record)}${weaker}`.trim() };
 }
