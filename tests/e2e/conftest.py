@@ -64,14 +64,19 @@ def service() -> Iterator[Server]:
 
 @pytest.fixture
 def visit(browser: Any) -> Iterator[Callable[..., Any]]:
-    """Opens a page at an address; afterwards it must not have logged an error or asked another host for anything."""
+    """Opens a page at an address, after the script ``before`` in it.
+
+    Afterwards it must not have logged an error or asked another host for anything.
+    """
     opened: list[tuple[Any, list[str]]] = []
 
-    def visit(address: str, width: int = 1440, height: int = 900, scheme: str = "light") -> Any:
+    def visit(address: str, width: int = 1440, height: int = 900, scheme: str = "light", before: str = "") -> Any:
         context = browser.new_context(
             viewport={"width": width, "height": height}, color_scheme=scheme, accept_downloads=True
         )
         context.set_default_timeout(15_000)
+        if before:
+            context.add_init_script(before)
         page, complaints = context.new_page(), []
         page.on("pageerror", lambda error: complaints.append(str(error)))
         # an answer with an error status is logged by the browser itself; the page's sentence about it is what is tested

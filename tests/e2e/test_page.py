@@ -146,6 +146,20 @@ def test_perspective_is_undone_where_that_is_asked_for(service: Server, visit: V
     assert difference(pixels_of(page, "after"), corrected(service, facade, "&correct=all")) < SAME
 
 
+def test_the_preview_needs_no_webgl(service: Server, visit: Visit, facade: Path) -> None:
+    """Where a browser or a driver has none the processor draws the same picture."""
+    page = visit(
+        f"http://{service.http}/",
+        before="""const get = HTMLCanvasElement.prototype.getContext;
+        HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
+          return kind.startsWith("webgl") ? null : get.call(this, kind, ...rest);
+        };""",
+    )
+    open_picture(page, facade)
+    set_range(page, "fit", 50)
+    assert difference(pixels_of(page, "after"), corrected(service, facade, "&fit=0.5")) < SAME
+
+
 def test_a_large_picture_is_previewed_small_and_downloaded_whole(service: Server, visit: Visit, tmp_path: Path) -> None:
     """Nothing that is taken away has the size of the preview."""
     large = tmp_path / "large.jpg"
@@ -240,6 +254,10 @@ def test_everything_can_be_done_from_the_keyboard(service: Server, visit: Visit)
     page.keyboard.press("Control+z")
     settle(page)
     assert page.get_attribute("[data-point='0']", "aria-valuetext") == before
+    page.keyboard.press("Escape")
+    settle(page)
+    settle(page)
+    assert page.evaluate("document.activeElement.id") == "adjust"
     tab_to("#save")
     page.keyboard.press("Enter")
     page.wait_for_selector("#saved:not([hidden])")

@@ -248,6 +248,7 @@ addEventListener("paste", (event) => {
   if (file) accept(file);
 });
 addEventListener("keydown", (event) => {
+  if (state.view === "adjust" && event.key === "Escape") adjust(false);
   if (state.view === "adjust" && (event.ctrlKey || event.metaKey) && event.key === "z") {
     event.preventDefault();
     editor.undo();

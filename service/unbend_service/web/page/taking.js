@@ -31,9 +31,10 @@ export function fitOption() {
 }
 
 export async function downloadPicture() {
-  const { body, name } = state.picture, stem = name.replace(/\.[^.]+$/, "");
+  const { body, name } = state.picture;
+  if (isLeftAlone()) return hand(body, name);
   const { picture, format } = await correct(body, { grid_id: await storedGrid(), fit: fitOption() });
-  hand(picture, `${stem}-${isLeftAlone() ? "as-it-was" : "straight"}.${format === "jpeg" ? "jpg" : format}`);
+  return hand(picture, `${name.replace(/\.[^.]+$/, "")}-straight.${format === "jpeg" ? "jpg" : format}`);
 }
 
 export function snippets(id) {
