@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from unbend._errors import InvalidImage as InvalidImage
     from unbend._errors import InvalidInput as InvalidInput
     from unbend._errors import InvalidOption as InvalidOption
+    from unbend._errors import MissingPackage as MissingPackage
     from unbend._errors import ModelUnavailable as ModelUnavailable
     from unbend._errors import Overloaded as Overloaded
     from unbend._errors import PoisonFrame as PoisonFrame
@@ -86,6 +87,7 @@ _HOMES = {
         "InvalidImage",
         "InvalidInput",
         "InvalidOption",
+        "MissingPackage",
         "ModelUnavailable",
         "Overloaded",
         "PoisonFrame",

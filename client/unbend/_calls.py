@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 from google.protobuf.message import Message
 
 from unbend import _types as types
@@ -76,7 +77,9 @@ def correct_call(
         request.answer_format = FORMATS[answer_format]
 
     def parse(answer: correction_pb2.CorrectResponse) -> types.Correction:
-        return types.Correction(_image(answer.data, packed), from_record(answer.record))
+        name = answer_format or next(name for name, number in FORMATS.items() if number == packed.layout.pixel_format)
+        before = packed.data if packed.shape is None else np.frombuffer(packed.data, np.uint8).reshape(packed.shape)
+        return types.Correction(_image(answer.data, packed), from_record(answer.record), name, before)
 
     return Call("/unbend.v1.CorrectionService/Correct", request, correction_pb2.CorrectResponse, parse)
 
@@ -208,7 +211,7 @@ def _from_guides(message: grid_pb2.Guides) -> types.Guides:
     return types.Guides(rows, columns)
 
 
-def _image(data: bytes, packed: Packed) -> types.Image:
+def _image(data: bytes, packed: Packed) -> npt.NDArray[np.uint8] | bytes:
     if packed.shape is not None and len(data) != len(packed.data):
         raise ServerFault(f"The server answered a picture of {len(packed.data)} bytes with {len(data)} bytes.")
     return unpack(data, packed)

@@ -90,10 +90,10 @@ class Client:
         (48, 64)
 
         Args:
-            image: (height, width), (height, width, 3) RGB or (height, width, 4) RGBA uint8, or the bytes of a jpeg,
-                png or webp file.
+            image: (height, width), (height, width, 3) RGB or (height, width, 4) RGBA uint8; the bytes of a jpeg, png
+                or webp file; a Pillow image, as it lies in memory; or a PyAV frame.
             pixel_format: how an array is to be read if not as above: ``bgr24``, ``bgra``, or ``i420`` and ``nv12`` of
-                shape (height * 3 / 2, width).
+                shape (height * 3 / 2, width); what a Pillow image or a PyAV frame is converted into.
             correct: ``nonlinear``: framing, tilt and perspective stay; ``all``: they are undone too. Ignored with
                 ``grid``.
             fit: ``crop`` (no invalid pixel), ``full`` (every source pixel), ``keep``, or 0..1 between crop and full.
@@ -106,7 +106,8 @@ class Client:
             min_confidence: 0..1; below it the picture is left alone. The server's setting if left out.
 
         Returns:
-            The corrected picture, an array of the same shape or a file, and the grid behind it.
+            The corrected picture, an array of the same shape or a file, and the grid behind it; ``to_pil()`` and
+            ``to_av()`` give it to Pillow and PyAV.
 
         Raises:
             InvalidInput: the picture or an option; the subclass says which.

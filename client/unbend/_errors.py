@@ -35,7 +35,8 @@ The tree; what stands in brackets is the builtin that the error also is::
     ├── DeadlineExceeded [TimeoutError]
     ├── Refused [PermissionError]  the server wants credentials, or others
     ├── ServerFault                the server failed, or does not speak unbend.v1
-    └── Closed                     the client or stream was closed before
+    ├── Closed                     the client or stream was closed before
+    └── MissingPackage [ImportError]  an optional package is not installed here
 """
 
 from __future__ import annotations
@@ -276,6 +277,15 @@ class Closed(UnbendError):
     """The client or stream was closed before."""
 
     code = "closed"
+
+
+class MissingPackage(UnbendError, ImportError):
+    """Something was asked for that needs a package which is not installed here; ``allowed`` says how to get it."""
+
+    code = "missing_package"
+
+    def __str__(self) -> str:
+        return f"{self.message} Remedy: {self.allowed}"
 
 
 def _family(kind: type[UnbendError]) -> Iterator[type[UnbendError]]:

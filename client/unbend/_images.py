@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from unbend._errors import EmptyBody, InvalidFrame, UnsupportedPixelFormat
+from unbend._foreign import to_sendable
 from unbend._types import Image
 from unbend.v1 import frame_pb2
 
@@ -55,9 +57,9 @@ def pack(image: Image, pixel_format: str | None = None) -> Packed:
     Raises:
         EmptyBody, InvalidFrame, UnsupportedPixelFormat.
     """
-    if isinstance(image, np.ndarray):
-        return _pack_array(image, pixel_format)
-    data = bytes(image)
+    data, pixel_format = to_sendable(image, pixel_format)
+    if isinstance(data, np.ndarray):
+        return _pack_array(data, pixel_format)
     if not data:
         raise EmptyBody("There is no image to be sent.")
     if pixel_format is not None and check_format(pixel_format) not in ENCODED:
@@ -66,7 +68,7 @@ def pack(image: Image, pixel_format: str | None = None) -> Packed:
     return Packed(frame_pb2.FrameFormat(pixel_format=FORMATS[name]), data, None)
 
 
-def unpack(data: bytes, packed: Packed) -> Image:
+def unpack(data: bytes, packed: Packed) -> npt.NDArray[np.uint8] | bytes:
     """The answer to a packed picture: a new array of its shape, or bytes."""
     if packed.shape is None:
         return data
@@ -106,14 +108,14 @@ class FrameLayout:
     def message(self) -> frame_pb2.FrameFormat:
         return frame_pb2.FrameFormat(pixel_format=FORMATS[self.pixel_format], width=self.width, height=self.height)
 
-    def pack(self, frame: Image) -> Packed:
+    def pack(self, image: Image) -> Packed:
         """Raises InvalidFrame for an array or bytes that are not of this layout."""
-        is_array = isinstance(frame, np.ndarray)
+        frame, _ = to_sendable(image, None if self.pixel_format in ENCODED else self.pixel_format)
         shape = tuple(frame.shape) if isinstance(frame, np.ndarray) else None
         if self.pixel_format in ENCODED:
-            if is_array:
+            if isinstance(frame, np.ndarray):
                 raise InvalidFrame(f"An array in a stream of {self.pixel_format} files.", allowed="bytes of a file")
-            return Packed(self.message, bytes(frame), None)
+            return Packed(self.message, frame, None)
         expected = frame_size_bytes(self.pixel_format, self.width, self.height)
         if isinstance(frame, np.ndarray):
             self._check_array(frame, expected)
@@ -123,10 +125,10 @@ class FrameLayout:
                 f"A {self.pixel_format} frame of {self.width}x{self.height} pixels has {expected} bytes, "
                 f"not {size_bytes}."
             )
-        data = frame.tobytes() if isinstance(frame, np.ndarray) else bytes(frame)
+        data = frame.tobytes() if isinstance(frame, np.ndarray) else frame
         return Packed(self.message, data, shape)
 
-    def unpack(self, data: bytes, shape: tuple[int, ...] | None) -> Image:
+    def unpack(self, data: bytes, shape: tuple[int, ...] | None) -> npt.NDArray[np.uint8] | bytes:
         """The answer to a frame: bytes, or a read-only array of the shape that was sent."""
         return data if shape is None else np.frombuffer(data, np.uint8).reshape(shape)
 

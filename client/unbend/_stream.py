@@ -79,8 +79,9 @@ class Stream:
         answers that are there are given before the next frame is drawn.
 
         Args:
-            frames: arrays, or bytes of image files, as the stream was opened for; or pairs of one and its presentation
-                time in microseconds.
+            frames: arrays, or bytes of image files, as the stream was opened for; Pillow images and PyAV frames, which
+                are converted to its pixel format; or pairs of one and its presentation time in microseconds, which a
+                PyAV frame brings with it.
 
         Raises:
             InvalidFrame: a frame that is not of the stream's layout.

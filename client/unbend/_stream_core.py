@@ -12,6 +12,7 @@ from unbend import _types as types
 from unbend._calls import from_record, to_correct, to_guides, to_rendering
 from unbend._errors import InvalidOption, ServerFault, StreamIdle, TooManyStreams, Unavailable, UnbendError
 from unbend._failures import of_frame
+from unbend._foreign import timestamp_us_of
 from unbend._images import FrameLayout
 from unbend._retries import backoff_s
 from unbend.v1 import correction_pb2
@@ -195,9 +196,18 @@ class StreamCore:
             error = of_frame(message.error.code, message.error.message)
         elif status is not types.FrameStatus.DROPPED:
             image = self._layout.unpack(message.data, sent.shape)
-        return types.StreamResult(sent.message.index, sent.message.timestamp_us, status, image, error)
+        return types.StreamResult(
+            sent.message.index,
+            sent.message.timestamp_us,
+            status,
+            image,
+            error,
+            self._layout.pixel_format,
+            self._layout.width,
+            self._layout.height,
+        )
 
 
 def split(item: types.Image | tuple[types.Image, int]) -> tuple[types.Image, int]:
-    """A frame and its timestamp in microseconds, 0 if it came without."""
-    return item if isinstance(item, tuple) else (item, 0)
+    """A frame and its timestamp in microseconds: that of a PyAV frame, else 0 if it came without."""
+    return item if isinstance(item, tuple) else (item, timestamp_us_of(item))

@@ -9,15 +9,52 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from unbend._errors import InvalidGrid, UnbendError
+from unbend import _foreign as foreign
+from unbend import _notebooks as notebooks
+from unbend._errors import InvalidFrame, InvalidGrid, UnbendError
 
-#: A picture: (height, width[, channels]) uint8, or the bytes of an image file.
-Image = npt.NDArray[np.uint8] | bytes
+
+class _PillowImage(Protocol):
+    """What is used of a ``PIL.Image.Image``."""
+
+    @property
+    def mode(self) -> str: ...
+
+    @property
+    def size(self) -> tuple[int, int]: ...
+
+    def convert(self, mode: str) -> Any: ...
+
+    def tobytes(self) -> bytes: ...
+
+
+class _PyavFrame(Protocol):
+    """What is used of an ``av.VideoFrame``."""
+
+    @property
+    def width(self) -> int: ...
+
+    @property
+    def height(self) -> int: ...
+
+    @property
+    def format(self) -> Any: ...
+
+    @property
+    def planes(self) -> Any: ...
+
+    def reformat(self, *, format: Any) -> Any: ...
+
+    def to_ndarray(self) -> Any: ...
+
+
+#: A picture: (height, width[, channels]) uint8, the bytes of an image file, a Pillow image, or a PyAV video frame.
+Image = npt.NDArray[np.uint8] | bytes | _PillowImage | _PyavFrame
 
 
 class Outcome(StrEnum):
@@ -162,15 +199,24 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Correction:
-    """One corrected picture.
+    """One corrected picture; a notebook shows it beside the one that was sent.
+
+    >>> correction = client.correct(np.zeros((48, 64, 3), np.uint8))
+    >>> correction.to_pil().size
+    (64, 48)
 
     Attributes:
-        image: an array of the shape that was sent, or the bytes of a file if a file was sent.
+        image: an array of the shape that was sent (of a Pillow image or a PyAV frame: of the array that it became), or
+            the bytes of a file if a file was sent.
         record: the grid behind it, before fit and strength; without lattice and guides.
+        pixel_format: what ``image`` holds: rgb24 for one, or jpeg.
+        before: what was sent, read-only, like ``image``; None if it is not known.
     """
 
     image: Any = field(repr=False)
     record: GridRecord
+    pixel_format: str = ""
+    before: Any = field(default=None, repr=False)
 
     @property
     def grid_id(self) -> str:
@@ -188,6 +234,27 @@ class Correction:
     def reason(self) -> str:
         return self.record.reason
 
+    def to_pil(self) -> Any:
+        """The picture as a ``PIL.Image.Image``. Raises MissingPackage without Pillow."""
+        return foreign.to_pil(self.image, self.pixel_format, *self._size())
+
+    def to_av(self) -> Any:
+        """The picture as an ``av.VideoFrame`` of the same pixel format. Raises MissingPackage without PyAV."""
+        return foreign.to_av(self.image, self.pixel_format, *self._size())
+
+    def _size(self) -> tuple[int, int]:
+        """Width and height in pixels; (0, 0) of a file."""
+        if isinstance(self.image, bytes):
+            return 0, 0
+        height, width = self.image.shape[:2]
+        return width, height * 2 // 3 if self.pixel_format in ("i420", "nv12") else height
+
+    def _repr_html_(self) -> str:
+        outcome = self.outcome.value.replace("_", " ")
+        reason = f" ({self.reason.replace('_', ' ')})" if self.reason else ""
+        caption = f"{outcome}{reason}, confidence {self.confidence:.2f}, grid {self.grid_id}"
+        return notebooks.draw_comparison(self.before, self.image, self.pixel_format, caption)
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class StreamResult:
@@ -200,6 +267,8 @@ class StreamResult:
         image: like the frame that was sent: an array of its shape (read-only: copy it to draw on it) or bytes; None
             for a frame that was dropped or failed.
         error: why it failed; None otherwise.
+        pixel_format: of the stream.
+        width, height: of the stream in pixels; 0 for files.
     """
 
     index: int
@@ -207,3 +276,24 @@ class StreamResult:
     status: FrameStatus
     image: Any = field(default=None, repr=False)
     error: UnbendError | None = None
+    pixel_format: str = field(default="", repr=False)
+    width: int = field(default=0, repr=False)
+    height: int = field(default=0, repr=False)
+
+    def to_pil(self) -> Any:
+        """The frame as a ``PIL.Image.Image``. Raises MissingPackage without Pillow, and InvalidFrame without image."""
+        return foreign.to_pil(self._picture(), self.pixel_format, self.width, self.height)
+
+    def to_av(self) -> Any:
+        """The frame as an ``av.VideoFrame`` of the same pixel format, without a timestamp.
+
+        Raises:
+            MissingPackage: PyAV is not installed.
+            InvalidFrame: the frame has no image, or chroma of an odd size.
+        """
+        return foreign.to_av(self._picture(), self.pixel_format, self.width, self.height)
+
+    def _picture(self) -> Any:
+        if self.image is None:
+            raise InvalidFrame(f"Frame {self.index} was {self.status.value}: there is no image.")
+        return self.image

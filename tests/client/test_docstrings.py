@@ -13,7 +13,7 @@ import unbend
 from tests.client.conftest import Server
 
 
-@pytest.mark.parametrize("name", ["unbend", "unbend._client", "unbend._async_client"])
+@pytest.mark.parametrize("name", ["unbend", "unbend._client", "unbend._async_client", "unbend._types"])
 def test_examples_do_what_they_say(server: Server, name: str) -> None:
     runner = doctest.DocTestRunner(verbose=False)
     with unbend.Client(server.target) as client:
