@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from unbend_service.adapters.codecs.jpegs import decode_rgb, encode_packed
+from unbend_service.adapters.codecs.jpegs import decode_luma, decode_rgb, encode_packed
 from unbend_service.adapters.codecs.pillow import PillowCodec
 from unbend_service.application.ports import Bytes
 from unbend_service.settings import Settings
@@ -39,6 +39,19 @@ def test_what_is_not_plain_is_left_to_pillow() -> None:
     body = written()
     for other in (written("L"), written("CMYK"), body[: len(body) // 2], b"\xff\xd8\xff", b"GIF89a", b""):
         assert decode_rgb(other) is None
+
+
+@pytest.mark.parametrize("mode", ["L", "RGB"])
+def test_luma_is_reduced_but_not_below_what_was_asked_for(mode: str) -> None:
+    """The smallest scale that is large enough is decoded, and at full scale the pixels are those of Pillow."""
+    body = written(mode, quality=90)
+    full = decode_luma(body, 67, 45)
+    half = decode_luma(body, 33, 22)
+    assert full is not None
+    assert half is not None
+    np.testing.assert_array_equal(full, np.asarray(Image.open(io.BytesIO(body)).convert("YCbCr"))[..., 0])
+    assert half.shape == (23, 34)
+    assert decode_luma(body[:200], 33, 22) is None
 
 
 @pytest.mark.parametrize("order", ["RGB", "BGR"])

@@ -28,6 +28,22 @@ def decode_rgb(body: bytes) -> Bytes | None:
         return None
 
 
+def decode_luma(body: bytes, least_width: int, least_height: int) -> Bytes | None:
+    """(height, width) uint8 luma of a YCbCr or grey file, not turned; None for any file that is better left to Pillow.
+
+    It is decoded at the smallest scale n/8 that is not below ``least_width`` and ``least_height``.
+    """
+    try:
+        if simplejpeg.decode_jpeg_header(body)[2] not in ("YCbCr", "Gray"):
+            return None
+        luma = simplejpeg.decode_jpeg(
+            body, colorspace="GRAY", min_width=least_width, min_height=least_height, strict=True
+        )
+    except ValueError:
+        return None
+    return np.asarray(luma)[..., 0]
+
+
 def encode_packed(
     pixels: Bytes, order: str, quality: int, subsampling: str, exif: bytes | None, icc_profile: bytes | None
 ) -> bytes:
