@@ -49,7 +49,9 @@ def test_luma_is_reduced_but_not_below_what_was_asked_for(mode: str) -> None:
     half = decode_luma(body, 33, 22)
     assert full is not None
     assert half is not None
-    np.testing.assert_array_equal(full, np.asarray(Image.open(io.BytesIO(body)).convert("YCbCr"))[..., 0])
+    reader = Image.open(io.BytesIO(body))
+    reader.draft("L", reader.size)
+    np.testing.assert_array_equal(full, np.asarray(reader))
     assert half.shape == (23, 34)
     assert decode_luma(body[:200], 33, 22) is None
 
