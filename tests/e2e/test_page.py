@@ -200,7 +200,7 @@ def test_a_file_that_is_no_picture_is_refused_with_a_sentence(
     page.set_input_files("#file", text)
     page.wait_for_selector("#error:not([hidden])")
     sentence = page.inner_text("#error")
-    assert "image" in sentence.lower()
+    assert sentence.startswith("notes.txt is not an image")
     assert sentence.endswith(".")
     assert "jpeg" in sentence
     shoot(page, "refused")

@@ -41,15 +41,15 @@ async function accept(file) {
     });
     if (mine === attempt) present(picture, record);
   } catch (error) {
-    if (mine === attempt) refuse(error);
+    if (mine === attempt) refuse(error, file.name);
   }
 }
 
 /** A picture that is at work already stays. */
-function refuse(error) {
+function refuse(error, name = "") {
   phase(state.picture ? "ready" : "empty");
   const place = get(state.picture ? "refused" : "error");
-  place.textContent = error.message;
+  place.textContent = name ? error.message.replace(/^The (body|image) /, `${name} `) : error.message;
   place.hidden = false;
   get(state.picture ? "another" : "choose").focus();
 }
