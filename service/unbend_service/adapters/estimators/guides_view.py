@@ -1,0 +1,124 @@
+"""Guides seen from the source: where they put points of the picture, and how far that is from another straightening.
+
+Isotropic frame (see `chains`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from unbend_service.domain.errors import InvalidGuides
+from unbend_service.domain.guides import TRUSTED_EXTENT, GuideFamily, Guides
+from unbend_service.domain.maps import Float64
+
+PIXELS = 128.0
+"""Pixels per isotropic unit of a picture whose long side has 256."""
+_LATTICE = 11
+_ROUNDS = 6
+_LEAST_SLOPE = 0.15
+_FURTHEST = 4.0
+_RIDGE = 1e-9
+_SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+"""Where x^2, xy, x, y^2, y, 1 stand in the outer product of (x, y, 1) with itself."""
+
+
+class GuidesView:
+    """The forward map, source to target, of guides, and a lattice of the picture on which it is compared.
+
+    Attributes:
+        source: (n, 2) float64, cell centres of an even lattice over the picture, isotropic.
+
+    Raises:
+        InvalidGuides: guides that put the picture nowhere.
+    """
+
+    def __init__(self, guides: Guides, half_width: float, half_height: float) -> None:
+        self._extent = np.array([half_width, half_height])
+        self._families = [(family, _monomials(family)) for family in (guides.columns, guides.rows)]
+        centres = (2 * np.arange(_LATTICE) + 1) / _LATTICE - 1
+        x, y = np.meshgrid(centres * half_width, centres * half_height)
+        self.source: Float64 = np.stack([x.ravel(), y.ravel()], axis=1)
+        self._target = self.straighten(self.source)
+        if not np.isfinite(self._target).all() or np.abs(self._target).max() > _FURTHEST:
+            raise InvalidGuides("The guides put parts of the picture nowhere.")
+
+    def straighten(self, source: Float64) -> Float64:
+        """Source (n, 2) -> target (n, 2), isotropic.
+
+        The column guide through (x, y) is the s that solves x = C_s(y): a polynomial in s of as many terms as there
+        are guides, taken by Newton steps; likewise t for rows.
+        """
+        x, y = (source / self._extent).T
+        columns, rows = self._families
+        return np.stack([_position(*columns, y, x), _position(*rows, x, y)], axis=1) * self._extent
+
+    def residual(self, straightened: Float64) -> Float64:
+        """What is left between another straightening and that of the guides after the best homography, px.
+
+        Args:
+            straightened: (..., n, 2) isotropic targets of ``source``.
+
+        Returns:
+            (..., n, 2), pixels of a 256 picture.
+        """
+        return (self._aligned(straightened)[1] - self._target) * PIXELS
+
+    def pose(self, straightened: Float64) -> Float64:
+        """(3, 3) homography, isotropic, that takes (n, 2) ``straightened`` nearest to the guides' targets."""
+        return np.asarray(self._aligned(straightened)[0])
+
+    def _aligned(self, straightened: Float64) -> tuple[Float64, Float64]:
+        """Homographies (..., 3, 3) by least squares, reweighted once from algebraic to geometric error, and what they
+        make of ``straightened``."""
+        x, y = straightened[..., 0], straightened[..., 1]
+        products = np.stack([x * x, x * y, x, y * y, y, np.ones_like(x)], axis=-2)
+        u, v = self._target.T
+        against = np.stack([np.ones_like(u), u, v, u * u + v * v], axis=-1)
+        matrix, weight = np.eye(3), np.ones_like(x)
+        for _ in range(2):
+            moments = (products * weight[..., None, :]) @ against
+            matrix = _homographies(moments)
+            depth = x * matrix[..., 2:, 0] + y * matrix[..., 2:, 1] + 1
+            weight = 1 / np.maximum(depth, 0.1) ** 2
+        projected = straightened @ np.swapaxes(matrix[..., :2, :2], -1, -2) + matrix[..., None, :2, 2]
+        return matrix, np.asarray(projected / np.maximum(depth, 1e-3)[..., None])
+
+
+def _homographies(moments: Float64) -> Float64:
+    """(..., 3, 3) from sums over points: (..., 6, 4) of (x^2, xy, x, y^2, y, 1) against (1, u, v, u^2 + v^2)."""
+    one, by_u, by_v, by_square = np.moveaxis(moments[..., _SYMMETRIC, :], -1, 0)
+    normal = np.zeros((*one.shape[:-2], 8, 8))
+    normal[..., :3, :3] = normal[..., 3:6, 3:6] = one
+    normal[..., :3, 6:] = -by_u[..., :2]
+    normal[..., 3:6, 6:] = -by_v[..., :2]
+    normal[..., 6:, :3] = -by_u[..., :2, :]
+    normal[..., 6:, 3:6] = -by_v[..., :2, :]
+    normal[..., 6:, 6:] = by_square[..., :2, :2]
+    normal += _RIDGE * np.eye(8)
+    right = np.concatenate([by_u[..., 2], by_v[..., 2], -by_square[..., :2, 2]], axis=-1)
+    solution = np.linalg.solve(normal, right[..., None])[..., 0]
+    last = np.ones((*solution.shape[:-1], 1))
+    return np.concatenate([solution, last], axis=-1).reshape(*solution.shape[:-1], 3, 3)
+
+
+def _monomials(family: GuideFamily) -> Float64:
+    """(K, K): values at the anchors -> coefficients of the polynomial through them, lowest power first."""
+    return np.linalg.inv(np.vander(family.anchors, increasing=True)).T
+
+
+def _position(family: GuideFamily, monomials: Float64, along: Float64, value: Float64) -> Float64:
+    """(n,) target position of the guide through ``value`` at ``along``, centred, continued straight far outside."""
+    inside = np.clip(along, -TRUSTED_EXTENT, TRUSTED_EXTENT)
+    heights = np.vander(inside, family.degree + 1, increasing=True) @ family.coefficients.T
+    deviation = (heights - family.anchors) @ monomials
+    position = value.copy()
+    for _ in range(_ROUNDS):
+        held = np.clip(position, -TRUSTED_EXTENT, TRUSTED_EXTENT)
+        offset, slope = np.zeros_like(position), np.zeros_like(position)
+        for power in range(deviation.shape[1] - 1, -1, -1):
+            slope = slope * held + offset
+            offset = offset * held + deviation[:, power]
+        error = position + offset + slope * (position - held) - value
+        position = position - np.clip(error / np.maximum(1 + slope, _LEAST_SLOPE), -0.5, 0.5)
+    return position
+

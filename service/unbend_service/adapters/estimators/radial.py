@@ -1,0 +1,278 @@
+"""Is it a lens, nothing at all, or something else? Chains and a network's guides, weighed together.
+
+Most real distortion is radial, and a lens of a few numbers, fitted to the edge chains, is several times more exact than
+guides that were guessed; but where there are few straight edges the guess is better, and a wave is no lens. So three
+kinds of hypotheses are compared by their evidence (log marginal likelihood):
+
+    identity   nothing but pose
+    radial     the division lens, one number (centred) or four (second term, free centre)
+    guides     what the network said, whatever shape it has
+
+All explain two observations. The **chains**, through the likelihood in `plumbline`. And the **guides** themselves,
+taken as a noisy view of the truth: at rms distance d from the truth, up to the best homography, a Student density
+(1 + d^2 / (NU e^2))^(-(NU + DIMENSIONS)/2), e being the error that the network expects of itself. Lenses are fitted by
+Gauss-Newton to both at once, and pay for their freedom by Laplace's approximation of the evidence (MacKay,
+"Bayesian interpolation", 1992); guides, which fit themselves, pay for as many dimensions as the Student density has.
+
+Lengths called px are of a picture whose long side has 256; everything is in the isotropic frame (see `chains`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from unbend_service.adapters.estimators.chains import EdgeChains
+from unbend_service.adapters.estimators.guides_view import PIXELS, GuidesView
+from unbend_service.adapters.estimators.plumbline import Plumbline
+from unbend_service.adapters.estimators.radial_family import IDENTITY, guides_of_lens, is_lens, straighten
+from unbend_service.domain.errors import InvalidGuides
+from unbend_service.domain.guides import Guides
+
+Float64 = npt.NDArray[np.float64]
+Kind = Literal["identity", "radial", "guides"]
+
+FEWEST_CHAINS = 5
+"""With fewer there is nothing to add to what the network says."""
+USUAL_ERROR_PX = 1.0
+"""Of guides that come without an expected error."""
+LEAST_ERROR_PX = 0.1
+NU = 5.0
+DIMENSIONS = 6.0
+"""Of the Student density of the network's error: heaviness of its tails, independent directions."""
+NATURAL_BEND_PX = 3.0
+"""Size of distortions that are neither nothing nor radial."""
+LOG_PRIOR: dict[Kind, float] = {"identity": -1.5, "radial": 0.0, "guides": -2.0}
+"""Up to a constant. Chosen with NU, DIMENSIONS and NATURAL_BEND_PX on training photographs under known distortions."""
+PRIOR_SPREAD: Float64 = np.array([0.25, 0.06, 0.06, 0.06])
+"""Of l1, l2, cx, cy."""
+
+_CENTRED = np.array([0])
+_FREE = np.array([0, 1, 2, 3])
+_SCAN = np.linspace(-0.4, 0.42, 21)
+_CENTRES: Float64 = 0.08 * np.stack(np.meshgrid([0.0, -1.0, 1.0], [0.0, -1.0, 1.0]), axis=-1).reshape(-1, 2)
+_STEPS = np.array([1e-3, 1e-3, 2e-3, 2e-3])
+_ROUNDS = 12
+_SHARPENING_ROUNDS = 6
+_SETTLED = 1e-2
+
+
+@dataclass(frozen=True, slots=True)
+class Refinement:
+    """What is believed after chains and guides were weighed.
+
+    Attributes:
+        guides: centred frame, pose included, so that ``nonlinear`` and ``all`` corrections both work.
+        kind: the hypothesis that won.
+        expected_error: rms error of the nonlinear part, px: the spread of the winner, and its distance from the
+            losers as far as they are probable.
+        probabilities: of ``identity``, ``radial`` and ``guides``; they add up to 1.
+        lens: (l1, l2, cx, cy) of a radial winner, isotropic; None otherwise.
+        chains: edge chains that had a say.
+    """
+
+    guides: Guides
+    kind: Kind
+    expected_error: float
+    probabilities: dict[Kind, float]
+    lens: Float64 | None
+    chains: int
+
+
+@dataclass(frozen=True)
+class _Hypothesis:
+    """A candidate: its nonlinear displacement (n, 2) px over the lattice, log evidence, and own rms error px."""
+
+    kind: Kind
+    residual: Float64
+    log_evidence: float
+    spread: float
+    lens: Float64 | None = None
+
+
+def refine(chains: EdgeChains, guides: Guides, guide_error: float | None) -> Refinement:
+    """Weighs what the network said against what the chains say; about 10 ms, thread-safe.
+
+    Args:
+        chains: of the picture, isotropic frame.
+        guides: of the same picture, centred frame.
+        guide_error: error of the nonlinear part that the network expects of its guides, px; None if it has no say.
+
+    Raises:
+        Nothing: where chains or guides are of no use the guides come back as they are.
+    """
+    error = USUAL_ERROR_PX if guide_error is None else max(guide_error, LEAST_ERROR_PX)
+    plumbline = Plumbline(chains)
+    if plumbline.count < FEWEST_CHAINS:
+        return _unchanged(guides, error, plumbline.count)
+    try:
+        view = GuidesView(guides, chains.half_width, chains.half_height)
+    except InvalidGuides:
+        return _unchanged(guides, error, plumbline.count)
+    model = _Model(plumbline, view, error)
+    start, said = model.scan()
+    centred = model.fit(start, _CENTRED)
+    hypotheses = [model.identity(), centred, model.fit(model.scan_centres(centred), _FREE), model.guides()]
+    scores = np.array([h.log_evidence for h in hypotheses])
+    probability = np.exp(scores - np.logaddexp.reduce(scores))
+    best = hypotheses[int(np.argmax(probability))]
+    apart = np.array([((h.residual - best.residual) ** 2).sum(-1).mean() + h.spread**2 for h in hypotheses])
+    sums: dict[Kind, float] = {"identity": 0.0, "radial": 0.0, "guides": 0.0}
+    for hypothesis, share in zip(hypotheses, probability, strict=True):
+        sums[hypothesis.kind] += float(share)
+    refined = guides
+    if best.kind != "guides":
+        lens = IDENTITY if best.lens is None else best.lens
+        # The pose is what the guides say beyond *their* lens: a better lens must not change it.
+        pose = view.pose(straighten(said, view.source))
+        try:
+            refined = guides_of_lens(lens, pose, chains.half_width, chains.half_height)
+        except InvalidGuides:
+            return _unchanged(guides, error, plumbline.count)
+    return Refinement(refined, best.kind, float(np.sqrt(probability @ apart)), sums, best.lens, plumbline.count)
+
+
+def _unchanged(guides: Guides, error: float, chains: int) -> Refinement:
+    return Refinement(guides, "guides", error, {"identity": 0.0, "radial": 0.0, "guides": 1.0}, None, chains)
+
+
+@dataclass(frozen=True)
+class _State:
+    """A lens and its neighbours: parameters (1 + k, 4), bends (1 + k, chains, 3), residual (1 + k, n, 2)."""
+
+    parameters: Float64
+    bends: Float64
+    residual: Float64
+    cost: Float64
+
+
+class _Model:
+    """Costs (negative log posteriors) of lenses."""
+
+    def __init__(self, plumbline: Plumbline, view: GuidesView, error: float) -> None:
+        self._plumbline = plumbline
+        self._view = view
+        self._error = error
+        self._count = len(view.source)
+        self._points = np.concatenate([plumbline.nodes, view.source])
+
+    def scan(self) -> tuple[Float64, Float64]:
+        """Of centred one-number lenses, each (4,): the best of a coarse scan, and the one nearest to the guides alone
+        (through the parabola of its squared distance)."""
+        lenses = np.zeros((len(_SCAN), 4))
+        lenses[:, 0] = _SCAN
+        state = self._look(lenses)
+        far = (state.residual**2).sum(-1).mean(-1)
+        nearest = int(np.clip(np.argmin(far), 1, len(far) - 2))
+        before, here, after = far[nearest - 1 : nearest + 2]
+        bottom = np.clip(0.5 * (before - after) / max(before - 2 * here + after, 1e-9), -1, 1)
+        said = np.array([_SCAN[nearest] + bottom * (_SCAN[1] - _SCAN[0]), 0.0, 0.0, 0.0])
+        return lenses[int(np.argmin(state.cost))], said
+
+    def scan_centres(self, near: _Hypothesis) -> Float64:
+        """The best of a lens and its likes with other centres, (4,)."""
+        lenses = np.repeat((IDENTITY if near.lens is None else near.lens)[None], len(_CENTRES), axis=0)
+        lenses[:, 2:] += _CENTRES
+        return np.asarray(lenses[int(np.argmin(self._look(lenses).cost))])
+
+    def identity(self) -> _Hypothesis:
+        state = self._look(IDENTITY[None])
+        return _Hypothesis("identity", state.residual[0], float(LOG_PRIOR["identity"] - state.cost[0]), 0.0)
+
+    def guides(self) -> _Hypothesis:
+        bends = self._plumbline.bends(self._view.straighten(self._plumbline.nodes))
+        said = float(self._plumbline.log_likelihood(bends))
+        freedom = 0.5 * DIMENSIONS * np.log1p((NATURAL_BEND_PX / self._error) ** 2)
+        nothing = np.zeros((self._count, 2))
+        return _Hypothesis("guides", nothing, float(LOG_PRIOR["guides"] + said - freedom), self._error)
+
+    def fit(self, start: Float64, free: npt.NDArray[np.int64]) -> _Hypothesis:
+        """The most probable lens with the ``free`` parameters, and its evidence, by Levenberg-Marquardt."""
+        state = self._around(start, free)
+        damping, normal = 1e-3, np.eye(len(free))
+        for _ in range(_ROUNDS):
+            normal, slope = self._normal(state, free)
+            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -slope)
+            tried = state.parameters[0].copy()
+            tried[free] += step
+            following = self._around(tried, free)
+            gain = float(state.cost[0] - following.cost[0])
+            if gain > 0:
+                state, damping = following, damping / 10
+                if gain < _SETTLED:
+                    break
+            else:
+                damping = max(10 * damping, 1e-2)
+                if damping > 1e3:
+                    break
+        normal, _ = self._normal(state, free)
+        _, volume = np.linalg.slogdet(normal * np.outer(PRIOR_SPREAD[free], PRIOR_SPREAD[free]))
+        sensitivity = self._sensitivity(state, free)
+        spread = np.sqrt(np.trace(np.linalg.solve(normal, sensitivity.T @ sensitivity)))
+        evidence = LOG_PRIOR["radial"] - np.log(2) - state.cost[0] - 0.5 * volume
+        state = self._sharpened(state, free, normal)
+        return _Hypothesis("radial", state.residual[0], float(evidence), float(spread), state.parameters[0])
+
+    def _sharpened(self, state: _State, free: npt.NDArray[np.int64], normal: Float64) -> _State:
+        """The last tenth of a pixel: Cauchy's cost at the spread of this picture's own straight chains.
+
+        The mixture is flat near its top, where every chain is as straight as chains usually are. The fit so far, with
+        its Hessian ``normal``, is the prior of this one.
+        """
+        begun = state.parameters[0, free]
+        for _ in range(_SHARPENING_ROUNDS):
+            weight, spread = self._plumbline.sure(state.bends[0])
+
+            def cost(found: _State, weight: Float64 = weight, spread: Float64 = spread) -> float:
+                away = found.parameters[0, free] - begun
+                square = ((found.bends[0] / spread) ** 2).sum(-1) / 2
+                return float(weight @ np.log1p(square) + 0.5 * away @ normal @ away)
+
+            square = ((state.bends[0] / spread) ** 2).sum(-1) / 2
+            pull = ((weight / (1 + square))[:, None] / spread**2).ravel()
+            bend = (state.bends[1:] - state.bends[0]).reshape(len(free), -1).T / _STEPS[free]
+            slope = bend.T @ (pull * state.bends[0].ravel()) + normal @ (state.parameters[0, free] - begun)
+            tried = state.parameters[0].copy()
+            tried[free] -= np.linalg.solve((bend.T * pull) @ bend + normal, slope)
+            following = self._around(tried, free)
+            if cost(following) >= cost(state) or not np.isfinite(following.cost[0]):
+                break
+            state = following
+        return state
+
+    def _around(self, lens: Float64, free: npt.NDArray[np.int64]) -> _State:
+        lenses = np.repeat(lens[None], 1 + len(free), axis=0)
+        lenses[1 + np.arange(len(free)), free] += _STEPS[free]
+        return self._look(lenses)
+
+    def _look(self, lenses: Float64) -> _State:
+        straightened = straighten(lenses, self._points)
+        bends = self._plumbline.bends(straightened[:, : -self._count])
+        residual = self._view.residual(straightened[:, -self._count :])
+        far = (residual**2).sum(-1).mean(-1)
+        cost = 0.5 * ((lenses / PRIOR_SPREAD) ** 2).sum(-1) - self._plumbline.log_likelihood(bends)
+        cost += 0.5 * (NU + DIMENSIONS) * np.log1p(far / (NU * self._error**2))
+        return _State(lenses, bends, residual, np.where(is_lens(lenses), cost, np.inf))
+
+    def _sensitivity(self, state: _State, free: npt.NDArray[np.int64]) -> Float64:
+        """(2 n, k) derivative of the nonlinear displacement, scaled so that its square is a mean over the lattice."""
+        difference = (state.residual[1:] - state.residual[0]).reshape(len(free), -1)
+        return np.asarray((difference / _STEPS[free, None]).T / np.sqrt(self._count))
+
+    def _normal(self, state: _State, free: npt.NDArray[np.int64]) -> tuple[Float64, Float64]:
+        """Hessian (k, k) of the reweighted cost and its gradient (k,)."""
+        prior = 1 / PRIOR_SPREAD[free] ** 2
+        weight = self._plumbline.precision(state.bends[0]).ravel()
+        bend = (state.bends[1:] - state.bends[0]).reshape(len(free), -1).T / _STEPS[free]
+        moved = self._sensitivity(state, free)
+        residual = state.residual[0].ravel() / np.sqrt(self._count)
+        pull = (NU + DIMENSIONS) / (NU * self._error**2 + residual @ residual)
+        normal = np.diag(prior) + (bend.T * weight) @ bend + pull * moved.T @ moved
+        slope = prior * state.parameters[0, free] + bend.T @ (weight * state.bends[0].ravel())
+        return normal, slope + pull * moved.T @ residual
+
+
+__all__ = ["PIXELS", "Kind", "Refinement", "refine"]
