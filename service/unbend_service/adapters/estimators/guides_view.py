@@ -50,7 +50,7 @@ class GuidesView:
         """
         x, y = (source / self._extent).T
         columns, rows = self._families
-        return np.stack([_position(*columns, y, x), _position(*rows, x, y)], axis=1) * self._extent
+        return np.asarray(np.stack([_position(*columns, y, x), _position(*rows, x, y)], axis=1) * self._extent)
 
     def residual(self, straightened: Float64) -> Float64:
         """What is left between another straightening and that of the guides after the best homography, px.
@@ -103,7 +103,7 @@ def _homographies(moments: Float64) -> Float64:
 
 def _monomials(family: GuideFamily) -> Float64:
     """(K, K): values at the anchors -> coefficients of the polynomial through them, lowest power first."""
-    return np.linalg.inv(np.vander(family.anchors, increasing=True)).T
+    return np.asarray(np.linalg.inv(np.vander(family.anchors, increasing=True)).T, dtype=np.float64)
 
 
 def _position(family: GuideFamily, monomials: Float64, along: Float64, value: Float64) -> Float64:
@@ -121,4 +121,3 @@ def _position(family: GuideFamily, monomials: Float64, along: Float64, value: Fl
         error = position + offset + slope * (position - held) - value
         position = position - np.clip(error / np.maximum(1 + slope, _LEAST_SLOPE), -0.5, 0.5)
     return position
-
