@@ -6,9 +6,9 @@ import argparse
 import sys
 from pathlib import Path
 
-from benchmarks import parity, render
+from benchmarks import estimate, http_load, parity, render, startup, stream
 
-SUITES = {"render": render}
+SUITES = {"render": render, "estimate": estimate, "http": http_load, "startup": startup, "stream": stream}
 
 
 def main() -> int:

@@ -62,13 +62,13 @@ class BareRemap:
     """
 
     def __init__(self, frame: Frame, grid: Grid) -> None:
-        self._maps: list[tuple[Float32, Float32]] = []
+        self.maps: list[tuple[Float32, Float32]] = []
         for plane in planes(frame.pixel_format, frame.width, frame.height):
-            self._maps.append(PlaneSampling.of(frame, plane).source_maps(grid, 0, plane.height))
+            self.maps.append(PlaneSampling.of(frame, plane).source_maps(grid, 0, plane.height))
 
     def __call__(self, frame: Frame) -> Bytes:
         drawn = np.empty(frame.data.size, np.uint8)
         targets = split_planes(drawn, frame.pixel_format, frame.width, frame.height)
-        for source, target, (x, y) in zip(frame.plane_arrays(), targets, self._maps, strict=True):
+        for source, target, (x, y) in zip(frame.plane_arrays(), targets, self.maps, strict=True):
             cv2.remap(source, x, y, cv2.INTER_LINEAR, dst=target, borderMode=cv2.BORDER_REPLICATE)
         return drawn
