@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
 import urllib.request
 from collections.abc import Callable
 from pathlib import Path
@@ -144,6 +146,33 @@ def test_perspective_is_undone_where_that_is_asked_for(service: Server, visit: V
     page.check("#all")
     settle(page)
     assert difference(pixels_of(page, "after"), corrected(service, facade, "&correct=all")) < SAME
+
+
+def test_the_snippets_of_a_saved_grid_give_the_previewed_picture(
+    service: Server, visit: Visit, facade: Path, tmp_path: Path
+) -> None:
+    """Strength is in the grid and the frame in the command: whoever copies either gets what was seen."""
+    page = visit(f"http://{service.http}/")
+    open_picture(page, facade)
+    page.check("#all")
+    set_range(page, "strength", 70)
+    set_range(page, "fit", 30)
+    page.click("#save")
+    page.wait_for_selector("#saved:not([hidden])")
+    preview = pixels_of(page, "after")
+    commands = {
+        "curl": ["bash", "-euc", page.text_content("#curl").replace(".jpg", ".png")],
+        "python": [
+            sys.executable,
+            "-c",
+            page.text_content("#python").replace("127.0.0.1:50051", service.grpc).replace(".jpg", ".png"),
+        ],
+    }
+    (tmp_path / "photo.png").write_bytes(facade.read_bytes())
+    for name, command in commands.items():
+        subprocess.run(command, cwd=tmp_path, check=True, timeout=60)
+        assert difference(preview, decoded((tmp_path / "straight.png").read_bytes())) < SAME, name
+        (tmp_path / "straight.png").unlink()
 
 
 def test_the_preview_needs_no_webgl(service: Server, visit: Visit, facade: Path) -> None:
