@@ -97,7 +97,7 @@ class StreamOptions:
 class _Sent:
     """A frame that is not answered yet, as it was sent, and the shape of its array."""
 
-    message: correction_pb2.StreamFrame
+    request: Request
     shape: tuple[int, ...] | None
 
 
@@ -132,15 +132,18 @@ class StreamCore:
 
     def first(self) -> list[Request]:
         """What a connection begins with: the opening, and the frames that no connection before it has answered."""
-        return [Request(open=self._opening), *(Request(frame=sent.message) for sent in self._unanswered)]
+        return [Request(open=self._opening), *(sent.request for sent in self._unanswered)]
 
     def accept(self, image: types.Image, timestamp_us: int) -> Request:
         """The message of the next frame. Raises InvalidFrame."""
         packed = self._layout.pack(image)
-        message = correction_pb2.StreamFrame(index=self._next_index, timestamp_us=timestamp_us, data=packed.data)
+        request = Request()
+        request.frame.index = self._next_index
+        request.frame.timestamp_us = timestamp_us
+        request.frame.data = packed.data  # filled in place: a frame that is put into a request is copied once more
         self._next_index += 1
-        self._unanswered.append(_Sent(message, packed.shape))
-        return Request(frame=message)
+        self._unanswered.append(_Sent(request, packed.shape))
+        return request
 
     def forget(self) -> None:
         """Nobody waits any more for the frames that are not answered; the connection has to be given up with them."""
@@ -184,7 +187,7 @@ class StreamCore:
         self._window = max(1, min(self._window, message.max_in_flight or self._window))
 
     def _answer(self, message: correction_pb2.StreamResult) -> types.StreamResult:
-        if not self._unanswered or message.index != self._unanswered[0].message.index:
+        if not self._unanswered or message.index != self._unanswered[0].request.frame.index:
             raise ServerFault(f"The server answered frame {message.index}, which is not the next one.")
         sent = self._unanswered.popleft()
         self._failures = 0
@@ -197,8 +200,8 @@ class StreamCore:
         elif status is not types.FrameStatus.DROPPED:
             image = self._layout.unpack(message.data, sent.shape)
         return types.StreamResult(
-            sent.message.index,
-            sent.message.timestamp_us,
+            sent.request.frame.index,
+            sent.request.frame.timestamp_us,
             status,
             image,
             error,

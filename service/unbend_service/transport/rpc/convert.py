@@ -153,17 +153,15 @@ def from_record(record: GridRecord, *, whole: bool) -> grid_pb2.GridRecord:
     )
 
 
-def from_result(result: StreamResult) -> correction_pb2.StreamResult:
-    error = None
+def fill_result(message: correction_pb2.StreamResult, result: StreamResult) -> None:
+    """Writes a result into an empty message; one that is put into another message later is copied once more."""
+    message.index = result.index
+    message.timestamp_us = result.timestamp_us
+    message.status = FRAME_STATUSES[result.status]
+    message.data = result.data
     if result.error is not None:
-        error = correction_pb2.FrameError(code=result.error.code, message=str(result.error))
-    return correction_pb2.StreamResult(
-        index=result.index,
-        timestamp_us=result.timestamp_us,
-        status=FRAME_STATUSES[result.status],
-        data=result.data,
-        error=error,
-    )
+        message.error.code = result.error.code
+        message.error.message = str(result.error)
 
 
 def _to_family(guides: list[grid_pb2.Guide]) -> GuideFamily:

@@ -26,8 +26,8 @@ from unbend_service.settings import Settings
 from unbend_service.transport.rpc.calls import Context
 from unbend_service.transport.rpc.convert import (
     ENCODED_FORMATS,
+    fill_result,
     from_record,
-    from_result,
     to_delivery,
     to_format,
     to_frame,
@@ -138,4 +138,6 @@ async def _frames(requests: AsyncIterator[Request]) -> AsyncIterator[StreamFrame
 def _response(event: StreamEvent) -> Response:
     if isinstance(event, GridFixed):
         return Response(grid=correction_pb2.StreamGrid(record=from_record(event.record, whole=False)))
-    return Response(result=from_result(event))
+    response = Response()
+    fill_result(response.result, event)
+    return response
