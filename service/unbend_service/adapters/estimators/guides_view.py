@@ -41,6 +41,18 @@ class GuidesView:
         self._target = self.straighten(self.source)
         if not np.isfinite(self._target).all() or np.abs(self._target).max() > _FURTHEST:
             raise InvalidGuides("The guides put parts of the picture nowhere.")
+        self._share = self._shares()
+
+    def _shares(self) -> Float64:
+        """(n,) by which squared target distances count, so that their mean is the squared error in source pixels over
+        the frame of the target: a point that is magnified counts less, one that leaves the frame hardly at all."""
+        target = self._target.reshape(_LATTICE, _LATTICE, 2)
+        step = 2 * self._extent / _LATTICE
+        down, right = np.gradient(target, step[1], axis=0), np.gradient(target, step[0], axis=1)
+        area = np.abs(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]).clip(0.2, 5).ravel()
+        reach = np.abs(self._target / self._extent).max(axis=1)
+        shown = np.where(reach <= 1.06, 1.0, np.where(reach <= 1.35, 0.15, 0.02))
+        return np.asarray(shown / (shown * area).mean())
 
     def straighten(self, source: Float64) -> Float64:
         """Source (n, 2) -> target (n, 2), isotropic.
@@ -53,15 +65,17 @@ class GuidesView:
         return np.asarray(np.stack([_position(*columns, y, x), _position(*rows, x, y)], axis=1) * self._extent)
 
     def residual(self, straightened: Float64) -> Float64:
-        """What is left between another straightening and that of the guides after the best homography, px.
+        """What is left between another straightening and that of the guides after the best homography.
 
         Args:
             straightened: (..., n, 2) isotropic targets of ``source``.
 
         Returns:
-            (..., n, 2), pixels of a 256 picture.
+            (..., n, 2); its mean square over the points is the squared error of the backward map over the frame of
+            the target, source pixels of a 256 picture.
         """
-        return (self._aligned(straightened)[1] - self._target) * PIXELS
+        left = self._aligned(straightened)[1] - self._target
+        return np.asarray(left * (PIXELS * np.sqrt(self._share))[:, None])
 
     def pose(self, straightened: Float64) -> Float64:
         """(3, 3) homography, isotropic, that takes (n, 2) ``straightened`` nearest to the guides' targets."""
@@ -74,12 +88,12 @@ class GuidesView:
         products = np.stack([x * x, x * y, x, y * y, y, np.ones_like(x)], axis=-2)
         u, v = self._target.T
         against = np.stack([np.ones_like(u), u, v, u * u + v * v], axis=-1)
-        matrix, weight = np.eye(3), np.ones_like(x)
+        matrix, weight = np.eye(3), np.broadcast_to(self._share, x.shape)
         for _ in range(2):
             moments = (products * weight[..., None, :]) @ against
             matrix = _homographies(moments)
             depth = x * matrix[..., 2:, 0] + y * matrix[..., 2:, 1] + 1
-            weight = 1 / np.maximum(depth, 0.1) ** 2
+            weight = self._share / np.maximum(depth, 0.1) ** 2
         projected = straightened @ np.swapaxes(matrix[..., :2, :2], -1, -2) + matrix[..., None, :2, 2]
         return matrix, np.asarray(projected / np.maximum(depth, 1e-3)[..., None])
 

@@ -20,14 +20,17 @@ IDENTITY: Float64 = np.zeros(4)
 ANCHORS: Float64 = np.linspace(-0.9, 0.9, 8)
 """Of the guides of a lens: four would cost it 0.4 px on average, six 0.05, eight nothing (strong lenses, 256 px)."""
 _DEGREE = 5
-_LATTICE = 21
+_LATTICE = 25
+_MARGIN = 1.25
+"""How far into the surroundings of the picture, centred source frame, guides are held to the lens."""
 _RIDGE = 1e-9
 _REACH = 1.6
 """Targets further out, centred frame, do not take part in the fit."""
 _LEAST_DENOMINATOR = 0.1
 _LEAST_GROWTH = 0.05
 _FURTHEST_CENTRE = 0.4
-_SQUARES: Float64 = np.linspace(0, 1.5, 24) ** 2
+_TRUSTED_RADIUS = 1.5
+_SQUARES: Float64 = np.linspace(0, _TRUSTED_RADIUS, 24) ** 2
 """Of radii up to just past the corner of a square picture."""
 
 
@@ -60,16 +63,29 @@ def guides_of_lens(parameters: Float64, pose: Float64, half_width: float, half_h
         InvalidGuides: the lens or the pose leave nothing to fit guides to.
     """
     extent = np.array([half_width, half_height])
-    source = target_lattice(_LATTICE, _LATTICE).reshape(-1, 2)
-    target = apply_homography(pose, straighten(parameters, source * extent)) / extent
+    source = target_lattice(_LATTICE, _LATTICE, _MARGIN).reshape(-1, 2)
+    target = apply_homography(pose, _continued(parameters, source * extent)) / extent
     reach = np.abs(target).max(axis=1)
-    # A little weight beyond the frame, so that guides go on smoothly where they are seldom seen.
-    weights = np.where(reach <= 1.1, 1.0, np.where(reach <= _REACH, 0.05, 0.0))
+    # A little weight beyond the frame and the picture, so that guides go on smoothly where they are seldom seen.
+    shown = (np.abs(source) <= 1.02).all(axis=1) & (reach <= 1.1)
+    weights = np.where(shown, 1.0, np.where(reach <= _REACH, 0.004, 0.0))
     target = target.clip(-_REACH, _REACH)
     return Guides(
         _fitted(target[:, 1], source[:, 0], source[:, 1], weights),
         _fitted(target[:, 0], source[:, 1], source[:, 0], weights),
     )
+
+
+def _continued(parameters: Float64, source: Float64) -> Float64:
+    """`straighten` of one lens (4,), continued at constant slope beyond the radius up to which it is a lens."""
+    offset = source - parameters[2:]
+    radius = np.hypot(*offset.T)
+    inside = np.minimum(radius, _TRUSTED_RADIUS)
+    square = inside**2
+    denominator = np.maximum(1 + square * (parameters[0] + square * parameters[1]), _LEAST_DENOMINATOR)
+    slope = (1 - square * (parameters[0] + 3 * square * parameters[1])) / denominator**2
+    straightened = inside / denominator + (radius - inside) * slope
+    return np.asarray(parameters[2:] + offset * (straightened / np.maximum(radius, 1e-9))[:, None])
 
 
 def _fitted(across: Float64, along: Float64, value: Float64, weights: Float64) -> GuideFamily:
