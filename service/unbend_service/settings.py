@@ -74,7 +74,7 @@ class Settings(BaseSettings):
 
 
 def settings_table() -> str:
-    """Markdown table of every setting, for the README."""
+    """Markdown table of every setting, for docs/configuration.md."""
     lines = ["| Variable | Default | Meaning |", "|---|---|---|"]
     for name, field in Settings.model_fields.items():
         default = "unset" if field.default is None else f"`{field.default}`"
