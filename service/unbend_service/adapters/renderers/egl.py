@@ -42,6 +42,18 @@ _FRAGMENT_SHADER = """
 #version 330 core
 in vec2 offset;
 uniform sampler2D image;
+uniform vec2 per_sample;
+out vec4 colour;
+void main() {
+    colour = textureLod(image, (gl_FragCoord.xy + offset) * per_sample, 0.0);
+}
+"""
+# a shader of its own, because on a software rasteriser the test takes a fifth of the frame
+_BORDERED_FRAGMENT_SHADER = """
+#version 330 core
+in vec2 offset;
+uniform sampler2D image;
+uniform vec2 per_sample;
 uniform vec2 low;
 uniform vec2 high;
 uniform vec4 border;
@@ -49,7 +61,7 @@ out vec4 colour;
 void main() {
     vec2 position = gl_FragCoord.xy + offset;
     bool outside = any(lessThan(position, low)) || any(greaterThan(position, high));
-    colour = outside ? border : textureLod(image, position / vec2(textureSize(image, 0)), 0.0);
+    colour = outside ? border : textureLod(image, position * per_sample, 0.0);
 }
 """
 
@@ -71,9 +83,11 @@ class _Mesh:
     vertices: Any
     triangles: Any
     array: Any
+    bordered_array: Any
 
     def release(self) -> None:
         self.array.release()
+        self.bordered_array.release()
         self.triangles.release()
         self.vertices.release()
 
@@ -108,7 +122,10 @@ class EglRenderer:
         self._longest_px = int(
             min(self._context.info["GL_MAX_TEXTURE_SIZE"], *self._context.info["GL_MAX_VIEWPORT_DIMS"])
         )
-        self._program = self._context.program(vertex_shader=_VERTEX_SHADER, fragment_shader=_FRAGMENT_SHADER)
+        self._program, self._bordered_program = (
+            self._context.program(vertex_shader=_VERTEX_SHADER, fragment_shader=shader)
+            for shader in (_FRAGMENT_SHADER, _BORDERED_FRAGMENT_SHADER)
+        )
         self._surfaces: Recent[tuple[int, int, int], _Surface] = Recent(cache_bytes, _Surface.release)
         self._meshes: Recent[str, _Mesh] = Recent(cache_bytes, _Mesh.release)
         self._info = self._describe()
@@ -147,27 +164,37 @@ class EglRenderer:
             for plane, colour in zip(layout, colours, strict=True):
                 part = slice(plane.offset, plane.offset + plane.size_bytes)
                 sampling = PlaneSampling.of(source, plane)
-                self._draw(plane, sampling, mesh, colour, source.data[part], target[part])
+                bordered = not sampling.shows_only_source(grid)
+                self._draw(plane, sampling, mesh, colour, bordered, source.data[part], target[part])
         except moderngl.Error as error:
             raise RenderFailed(f"OpenGL could not render the frame: {error}") from error
         if (code := self._context.error) != "GL_NO_ERROR":
             raise RenderFailed(f"OpenGL reported {code}.")
 
     def _draw(
-        self, plane: Plane, sampling: PlaneSampling, mesh: _Mesh, colour: tuple[int, ...], source: Bytes, target: Bytes
+        self,
+        plane: Plane,
+        sampling: PlaneSampling,
+        mesh: _Mesh,
+        colour: tuple[int, ...],
+        bordered: bool,
+        source: Bytes,
+        target: Bytes,
     ) -> None:
         surface = self._surface(plane)
         surface.texture.write(source, alignment=1)
-        uniform = self._program
+        uniform = self._bordered_program if bordered else self._program
         uniform["scale"] = tuple(sampling.extent / (plane.width, plane.height))
         uniform["extent"] = tuple(sampling.extent)
-        # OpenGL counts positions from the edge of the first sample, not from its centre
-        uniform["low"] = (sampling.valid_low + 0.5,) * 2
-        uniform["high"] = tuple(high + 0.5 for high in sampling.valid_high)
-        uniform["border"] = tuple(np.array([*colour, 0, 0, 0][:4]) / 255)
+        uniform["per_sample"] = 1 / plane.width, 1 / plane.height
+        if bordered:
+            # OpenGL counts positions from the edge of the first sample, not from its centre
+            uniform["low"] = (sampling.valid_low + 0.5,) * 2
+            uniform["high"] = tuple(high + 0.5 for high in sampling.valid_high)
+            uniform["border"] = tuple(np.array([*colour, 0, 0, 0][:4]) / 255)
         surface.framebuffer.use()
         surface.texture.use(0)
-        mesh.array.render(moderngl.TRIANGLES)
+        (mesh.bordered_array if bordered else mesh.array).render(moderngl.TRIANGLES)
         surface.framebuffer.read_into(target, components=plane.channels, alignment=1)
 
     def _surface(self, plane: Plane) -> _Surface:
@@ -195,8 +222,11 @@ class EglRenderer:
         corners = mesh_triangles(*points.shape[:2])
         vertices, triangles = self._context.buffer(points), self._context.buffer(corners)
         layout = [(vertices, "2f 2f", "target", "displacement")]
-        array = self._context.vertex_array(self._program, layout, triangles, index_element_size=4)
-        return self._meshes.put(grid.id, _Mesh(vertices, triangles, array), points.nbytes + corners.nbytes)
+        arrays = [
+            self._context.vertex_array(program, layout, triangles, index_element_size=4)
+            for program in (self._program, self._bordered_program)
+        ]
+        return self._meshes.put(grid.id, _Mesh(vertices, triangles, *arrays), points.nbytes + corners.nbytes)
 
     def close(self) -> None:
         if self._closed:
@@ -205,5 +235,6 @@ class EglRenderer:
         self._surfaces.clear()
         self._meshes.clear()
         self._program.release()
+        self._bordered_program.release()
         self._context.release()
         EglRenderer._open = False
