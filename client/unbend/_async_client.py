@@ -106,7 +106,15 @@ class AsyncClient:
 
 
 class AsyncGrids:
-    """The grids that the server keeps; ``client.grids``."""
+    """The grids that the server keeps; ``client.grids``.
+
+    >>> async def keep(image):
+    ...     async with unbend.AsyncClient("127.0.0.1:50051") as client:
+    ...         estimate = await client.estimate(image)
+    ...         return (await client.grids.get(estimate.grid_id)).outcome
+    >>> asyncio.run(keep(np.zeros((48, 64, 3), np.uint8)))
+    <Outcome.CORRECTED: 'corrected'>
+    """
 
     def __init__(self, client: AsyncClient) -> None:
         self._client = client

@@ -23,6 +23,13 @@ class AsyncStream:
 
     Everything is as of :class:`unbend.Stream`, but answers are given as soon as they are there, while the next frame
     is waited for.
+
+    >>> async def watch(frames):
+    ...     async with unbend.AsyncClient("127.0.0.1:50051") as client:
+    ...         async with client.stream(64, 48, "gray8") as stream:
+    ...             return [result.index async for result in stream.correct(frames)]
+    >>> asyncio.run(watch([np.zeros((48, 64), np.uint8)] * 3))
+    [0, 1, 2]
     """
 
     def __init__(

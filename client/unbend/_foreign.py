@@ -72,7 +72,7 @@ def to_sendable(image: Any, pixel_format: str | None = None) -> tuple[Bytes | by
 def timestamp_us_of(image: object) -> int:
     """Presentation time of a PyAV frame in microseconds; 0 for everything else."""
     time_s = getattr(image, "time", None) if is_pyav(image) else None
-    return 0 if time_s is None else max(0, round(time_s * 1_000_000))
+    return 0 if time_s is None else round(time_s * 1_000_000)
 
 
 def to_pil(image: Bytes | bytes, pixel_format: str, width: int, height: int) -> Any:

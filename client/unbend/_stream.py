@@ -22,6 +22,14 @@ class Stream:
 
     If the connection breaks, the stream is opened again under its id and the frames that were not answered are sent
     again: the caller sees each frame answered once and in order.
+
+    >>> frames = (np.full((48, 64), level, np.uint8) for level in range(3))
+    >>> with client.stream(64, 48, "gray8", stream_id="door-camera") as stream:
+    ...     print([result.index for result in stream.correct(frames)])
+    [0, 1, 2]
+    >>> with client.stream(64, 48, "gray8", stream_id="door-camera") as stream:
+    ...     stream.resumed
+    True
     """
 
     def __init__(

@@ -75,7 +75,12 @@ class FrameStatus(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Border:
-    """What is painted where the source has nothing; 0..255 each, alpha where the format has it."""
+    """What is painted where the source has nothing; 0..255 each, alpha where the format has it.
+
+    >>> white = unbend.Border(255, 255, 255)
+    >>> client.correct(np.zeros((48, 64, 3), np.uint8), fit="full", border=white).image.max()
+    np.uint8(255)
+    """
 
     red: int = 0
     green: int = 0
@@ -86,6 +91,10 @@ class Border:
 @dataclass(frozen=True, slots=True)
 class Guide:
     """One polynomial guide.
+
+    >>> bulging = unbend.Guide(anchor=-0.5, coefficients=(-0.55, 0.0, 0.1))  # y = -0.55 + 0.1 x^2
+    >>> len(bulging.coefficients)
+    3
 
     Attributes:
         anchor: where it lies once straight, centred target coordinate in (-1, 1).
@@ -99,7 +108,14 @@ class Guide:
 
 @dataclass(frozen=True, slots=True)
 class Guides:
-    """The curves that ought to be straight: at least two near-horizontal ones and two near-vertical ones."""
+    """The curves that ought to be straight: at least two near-horizontal ones and two near-vertical ones.
+
+    >>> rows = [unbend.Guide(-0.5, (-0.55, 0.0, 0.1)), unbend.Guide(0.5, (0.55, 0.0, -0.1))]
+    >>> columns = [unbend.Guide(-0.5, (-0.5, 0.0)), unbend.Guide(0.5, (0.5, 0.0))]
+    >>> by_hand = client.grids.put(unbend.Guides(rows, columns))
+    >>> by_hand.outcome
+    <Outcome.CORRECTED: 'corrected'>
+    """
 
     rows: Sequence[Guide]
     columns: Sequence[Guide]
@@ -108,6 +124,14 @@ class Guides:
 @dataclass(frozen=True, eq=False, slots=True)
 class Grid:
     """A lattice of source points for a regular lattice over the target, the backward map of the correction.
+
+    >>> s, t = np.meshgrid(np.linspace(-1, 1, 33), np.linspace(-1, 1, 33))
+    >>> shrink = 1 - 0.1 * (s * s + t * t)  # a barrel, undone
+    >>> grid = unbend.Grid(np.stack([s * shrink, t * shrink], axis=-1))
+    >>> grid.rows, grid.columns
+    (33, 33)
+    >>> client.correct(np.zeros((48, 64, 3), np.uint8), grid=grid).image.shape
+    (48, 64, 3)
 
     Attributes:
         source: (rows, columns, 2) float32, 2..1025 rows and columns, centred: ``source[r, c] = (x, y)`` is the source
@@ -138,6 +162,10 @@ class Grid:
 class GridRecord:
     """A grid and where it came from.
 
+    >>> record = client.estimate(np.zeros((48, 64, 3), np.uint8)).record
+    >>> client.grids.get(record.grid_id).grid_id == record.grid_id
+    True
+
     Attributes:
         grid_id: content-derived; stands for the grid in later calls.
         confidence: 0..1; ``confidence_kind`` says what it means (``mirror_agreement``, ``calibrated_probability`` or
@@ -163,7 +191,12 @@ class GridRecord:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Estimate:
-    """How one picture is bent.
+    """How one picture is bent; given as ``grid``, it corrects others of the same camera.
+
+    >>> estimate = client.estimate(np.zeros((48, 64, 3), np.uint8))
+    >>> others = [client.correct(np.zeros((48, 64, 3), np.uint8), grid=estimate) for _ in range(2)]
+    >>> {other.grid_id for other in others} == {estimate.grid_id}
+    True
 
     Attributes:
         record: what is stored on the server under ``grid_id``, lattice and guides included.
@@ -259,6 +292,11 @@ class Correction:
 @dataclass(frozen=True, eq=False, slots=True)
 class StreamResult:
     """The answer to one frame.
+
+    >>> with client.stream(64, 48) as stream:
+    ...     (result,) = stream.correct([(np.zeros((48, 64, 3), np.uint8), 40_000)])
+    >>> result.status, result.timestamp_us, result.to_pil().size
+    (<FrameStatus.CORRECTED: 'corrected'>, 40000, (64, 48))
 
     Attributes:
         index: number of the frame in its stream, from 0.
