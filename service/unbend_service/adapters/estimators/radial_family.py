@@ -21,7 +21,7 @@ ANCHORS: Float64 = np.linspace(-0.9, 0.9, 8)
 """Of the guides of a lens: four would cost it 0.4 px on average, six 0.05, eight nothing (strong lenses, 256 px)."""
 _DEGREE = 5
 _LATTICE = 25
-_MARGIN = 1.25
+_MARGIN = 1.12
 """How far into the surroundings of the picture, centred source frame, guides are held to the lens."""
 _RIDGE = 1e-9
 _REACH = 1.6
@@ -68,7 +68,7 @@ def guides_of_lens(parameters: Float64, pose: Float64, half_width: float, half_h
     reach = np.abs(target).max(axis=1)
     # A little weight beyond the frame and the picture, so that guides go on smoothly where they are seldom seen.
     shown = (np.abs(source) <= 1.02).all(axis=1) & (reach <= 1.1)
-    weights = np.where(shown, 1.0, np.where(reach <= _REACH, 0.004, 0.0))
+    weights = np.where(shown, 1.0, np.where(reach <= _REACH, 0.05, 0.0))
     target = target.clip(-_REACH, _REACH)
     return Guides(
         _fitted(target[:, 1], source[:, 0], source[:, 1], weights),
