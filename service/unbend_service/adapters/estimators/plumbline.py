@@ -9,8 +9,9 @@ the map. In logarithms and relative to "anything else", a chain i with bend b_i 
 
 a redescending robust cost. Spreads, odds by length, and the weight by length (chains of one texture repeat one another,
 long ones stand alone) were measured by maximum likelihood of the true lens among 40 division lenses near and far, on
-1,200 training photographs warped with a known lens; on 300 others the mean error of the most probable l1 is 0.043,
-where spreads taken from undistorted photographs alone give 0.12.
+1,200 training photographs warped with a known lens, smoothed by as much as photographs have lenses of their own. On
+300 others the most probable l1 is off by 0.046 on average (0.013 in the median); with spreads simply taken from
+undistorted photographs it was off by 0.12 on a set of the same kind.
 
 Isotropic frame (see `chains`). A chain is reduced to six nodes of the quartic in its arc length that fits all its
 points; its **bend** is the degree 2 to 4 Legendre coefficients across it, in pixels of the picture searched.
