@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from tests.acceptance.conftest import Server
+from unbend_service.settings import Settings
 
 ROOT = Path(__file__).parent.parent.parent
 README = ROOT / "README.md"
@@ -42,6 +43,14 @@ def test_the_configuration_table_is_that_of_the_settings() -> None:
         sys.path.pop(0)
     page = PAGE.read_text()
     assert with_table(page) == page, "run `make docs`"
+
+
+@pytest.mark.parametrize("page", [README, ROOT / "docs/accuracy.md"], ids=lambda page: page.name)
+def test_the_figures_are_those_of_the_model_that_is_used_by_default(page: Path) -> None:
+    (figures,) = re.findall(r"^<!-- figures:.*?^<!-- /figures -->", page.read_text(), re.MULTILINE | re.DOTALL)
+    model = Settings.model_fields["model"].default
+    assert re.search(rf"\b{model}\b", figures), f"{page.name} tells the figures of another model than {model!r}"
+    assert "doing nothing" in figures
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
