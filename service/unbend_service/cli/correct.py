@@ -9,6 +9,8 @@ from typing import Annotated, Any
 import typer
 
 from unbend_service.application.correction import CorrectedImage, CorrectOptions
+from unbend_service.cli.batch_run import correct_jobs, report_batch
+from unbend_service.cli.batches import find_jobs, is_batch
 from unbend_service.cli.private import private_service
 from unbend_service.cli.reporting import console, errors_reported, fail, print_json
 from unbend_service.cli.serve import read_settings
@@ -21,8 +23,15 @@ _FORMATS = {".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png", ".webp": "webp"}
 
 
 def correct(
-    source: Annotated[Path, typer.Argument(metavar="IN", help="A photograph: jpeg, png, webp, tiff or bmp.")],
-    target: Annotated[Path, typer.Argument(metavar="OUT", help="Where to write it: .jpg, .png or .webp.")],
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="IN", help="A photograph: jpeg, png, webp, tiff, bmp; or a directory, or '**/*.jpg'."
+        ),
+    ],
+    target: Annotated[
+        Path, typer.Argument(metavar="OUT", help="Where to write it: .jpg, .png or .webp; for many, a directory.")
+    ],
     what: Annotated[str, typer.Option("--correct", help="nonlinear or all.")] = "nonlinear",
     fit: Annotated[str, typer.Option(help="keep, crop, full, or a number 0..1 between crop and full.")] = "crop",
     strength: Annotated[float, typer.Option(help="0..1, blend with the original.")] = 1.0,
@@ -32,9 +41,28 @@ def correct(
     ] = None,
     model: Annotated[str | None, typer.Option(help="Name of a shipped model, or a path.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT if it is there.")] = False,
+    workers: Annotated[int, typer.Option(min=0, help="Render workers for many photographs; 0: one a core.")] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Straighten one photograph. Needs no running server."""
+    """Straighten a photograph, or many. Needs no running server.
+
+    Of many, those whose result is there already are skipped, so that a command that was interrupted goes on where it
+    was; results appear whole or not at all.
+    """
+    if is_batch(source):
+        with errors_reported():
+            jobs = find_jobs(source, target)
+            batch_options = CorrectOptions(
+                correct=Correct.parse(what),
+                fit=Fit.parse(fit),
+                strength=check_strength(strength),
+                quality=quality,
+                min_confidence=min_confidence,
+            )
+            batch_settings: dict[str, Any] = {"workers": workers} | ({} if model is None else {"model": model})
+            batch = correct_jobs(read_settings(**batch_settings), jobs, batch_options, overwrite=overwrite)
+        report_batch(batch, as_json)
+        return
     with errors_reported():
         if target.exists() and not overwrite:
             fail(f"{target} is there already; --overwrite replaces it", 2)
@@ -50,7 +78,7 @@ def correct(
             min_confidence=min_confidence,
         )
         chosen: dict[str, Any] = {"workers": 1} | ({} if model is None else {"model": model})
-        result = asyncio.run(_correct(read_settings(**chosen), source.read_bytes(), options))
+        result = asyncio.run(_correct(read_settings(**chosen), Path(source).read_bytes(), options))
         target.write_bytes(result.body)
     _report(result, target, as_json)
 

@@ -1,0 +1,1 @@
+"""Video files, streams and pipes: PyAV (extra ``[video]``) and y4m."""

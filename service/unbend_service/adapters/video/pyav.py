@@ -1,0 +1,31 @@
+"""PyAV, loaded when it is first needed, and its errors as ours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from unbend_service.domain.errors import InvalidImage, Unavailable
+
+
+def load_av() -> Any:
+    """The module ``av``. Raises Unavailable without the extra ``[video]``."""
+    try:
+        import av
+    except ImportError as error:
+        raise Unavailable("PyAV is not installed here.", allowed="pip install 'unbend[video]'") from error
+    av.logging.set_level(av.logging.ERROR)
+    return av
+
+
+@contextmanager
+def av_errors(what: str) -> Iterator[None]:
+    """Turns FFmpeg's errors into InvalidImage, whose message starts with ``what``; errors of files stay OSError."""
+    av = load_av()
+    try:
+        yield
+    except av.error.FFmpegError as error:
+        if isinstance(error, FileNotFoundError | PermissionError | IsADirectoryError):
+            raise
+        raise InvalidImage(f"{what}: {error.strerror or error}") from error
