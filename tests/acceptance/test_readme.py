@@ -78,7 +78,8 @@ def test_shell_snippets_work_as_they_stand(server: Server, tmp_path: Path, snipp
     ready = snippet.replace("localhost:8080", server.http).replace(".venv/bin/unbend", f"{sys.executable} -m unbend")
     ready = ready.replace("python3 -c", f"{sys.executable} -c").replace("curl -sS", "curl -sS --fail-with-body")
     # the doctor is to look at free ports, whatever else runs on this machine
-    environment = os.environ | {"UNBEND_HTTP_PORT": "0", "UNBEND_GRPC_PORT": "0"}
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    environment = os.environ | {"UNBEND_HTTP_PORT": "0", "UNBEND_GRPC_PORT": "0", "PATH": path}
     subprocess.run(["bash", "-euc", ready], cwd=tmp_path, env=environment, check=True, timeout=120)
     for name in re.findall(r"-o ([\w.]+)", snippet):
         assert (tmp_path / name).stat().st_size > 0
