@@ -60,7 +60,25 @@ parity: setup-dev  ## Compare the pictures of both renderers on ten photographs 
 
 .PHONY: parity
 
-docs: setup-dev  ## Write the configuration table of the README
+docs: setup-dev  ## Write the table of docs/configuration.md
 	$(BIN)/python docs/settings.py
 
 .PHONY: docs
+
+MACHINE ?= $(shell hostname)
+BENCHES := bench-render bench-stream bench-http bench-estimate bench-startup
+
+$(BENCHES): bench-%: setup-dev
+	$(BIN)/python -m benchmarks $* --json benchmarks/results/$(MACHINE)/$*.json
+
+bench-render:  ## Measure the renderers beside bare remap and moderngl (MACHINE names the results)
+bench-stream:  ## Measure streams beside a bare echo, one process, ffmpeg
+bench-http:  ## Measure HTTP beside the same work in process
+bench-estimate:  ## Measure round trips of estimates
+bench-startup:  ## Measure the start of the service and the import of the client
+bench: $(BENCHES) bench-summary  ## Measure everything
+
+bench-summary: setup-dev  ## Write the results into benchmarks/README.md
+	$(BIN)/python -m benchmarks summary
+
+.PHONY: bench bench-summary $(BENCHES)

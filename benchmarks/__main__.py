@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from benchmarks import estimate, http_load, parity, render, startup, stream
+from benchmarks import estimate, http_load, parity, render, startup, stream, summary
 
 SUITES = {"render": render, "estimate": estimate, "http": http_load, "startup": startup, "stream": stream}
 
@@ -15,6 +15,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     suites = parser.add_subparsers(dest="suite", required=True)
     parity.add_arguments(suites.add_parser("parity", help=parity.__doc__))
+    summary.add_arguments(suites.add_parser("summary", help=summary.__doc__))
     for name, suite in SUITES.items():
         options = suites.add_parser(name, help=suite.__doc__)
         options.add_argument("--json", type=Path, help="file for the results")
@@ -23,6 +24,8 @@ def main() -> int:
     arguments = parser.parse_args()
     if arguments.suite == "parity":
         return parity.run(arguments)
+    if arguments.suite == "summary":
+        return summary.run(arguments)
     report = SUITES[arguments.suite].run(arguments)
     if arguments.json is not None:
         report.write(arguments.json)

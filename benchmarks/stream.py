@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Report:
     """Frames a second of whole streams, whose grid is known, measured at the client."""
     report = Report("stream")
-    runs, count = (2, 8) if arguments.quick else (arguments.runs, arguments.frames)
+    runs, count = (2, 4) if arguments.quick else (arguments.runs, arguments.frames)
     cv2.setNumThreads(usable_cores())
     grid = barrel_grid()
     with served(renderer="cpu") as service:
