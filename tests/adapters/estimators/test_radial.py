@@ -11,10 +11,12 @@ from unbend_service.adapters.estimators.chains import EdgeChains, extract
 from unbend_service.adapters.estimators.guides_view import GuidesView
 from unbend_service.adapters.estimators.radial import Refinement, refine
 from unbend_service.adapters.estimators.radial_family import guides_of_lens, is_lens, straighten
+from unbend_service.domain.decision import spin_grid
 from unbend_service.domain.fitting import fit_guides
 from unbend_service.domain.guides import Guides
 from unbend_service.domain.homography import apply_homography, fit_homography
 from unbend_service.domain.maps import BackwardMap, Float64, target_lattice
+from unbend_service.domain.records import Correct
 
 SIDE = 256
 PIXELS = SIDE / 2
@@ -116,6 +118,18 @@ def test_the_pose_that_the_network_saw_is_kept() -> None:
     expected = apply_homography(pose, straighten(lens, source))
     assert refined.kind == "radial"
     assert np.hypot(*(found - expected).T).mean() * PIXELS < 1.0
+
+
+def test_a_strong_pincushion_seen_askew_is_still_straightened() -> None:
+    """A network that believes in a strong shear does not spoil the lens: the nonlinear grid is that of the lens."""
+    lens = np.array([0.257, 0.0, 0.0, 0.0])
+    shear = np.array([[1.0, 0.32, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    chains = draw([seen_through(lens, line) for line in lines(np.random.default_rng(5))])
+    refined = refine(chains, guides_of_lens(0.9 * lens, shear, 1.0, 1.0), 0.8)
+    upright = guides_of_lens(lens, np.eye(3), 1.0, 1.0)
+    found, expected = (spin_grid(guides, Correct.NONLINEAR, 17).source for guides in (refined.guides, upright))
+    shown = (np.abs(expected) <= 1).all(axis=-1)
+    assert np.hypot(*(found - expected)[shown].T).mean() * PIXELS < 1.0
 
 
 def test_a_wide_picture_has_round_lenses_too() -> None:

@@ -55,6 +55,8 @@ _CENTRED = np.array([0])
 _FREE = np.array([0, 1, 2, 3])
 _SCAN = np.linspace(-0.4, 0.42, 21)
 _CENTRES: Float64 = 0.08 * np.stack(np.meshgrid([0.0, -1.0, 1.0], [0.0, -1.0, 1.0]), axis=-1).reshape(-1, 2)
+_STRONG_PINCUSHION = 0.1
+_STRONG_POSE = 0.15
 _STEPS = np.array([1e-3, 1e-3, 2e-3, 2e-3])
 _ROUNDS = 12
 _SHARPENING_ROUNDS = 6
@@ -128,12 +130,22 @@ def refine(chains: EdgeChains, guides: Guides, guide_error: float | None) -> Ref
     if best.kind != "guides":
         lens = IDENTITY if best.lens is None else best.lens
         # The pose is what the guides say beyond *their* lens: a better lens must not change it.
-        pose = view.pose(straighten(said, view.source))
+        pose = _kept_pose(view.pose(straighten(said, view.source)), lens)
         try:
             refined = guides_of_lens(lens, pose, chains.half_width, chains.half_height)
         except InvalidGuides:
             return _unchanged(guides, error, plumbline.count)
     return Refinement(refined, best.kind, float(np.sqrt(probability @ apart)), sums, best.lens, plumbline.count)
+
+
+def _kept_pose(pose: Float64, lens: Float64) -> Float64:
+    """``pose``, or none where guides cannot hold it together with the lens.
+
+    A strong pincushion leaves target points without a source. Guides go on there, and seen askew they meet again in
+    wrong places; the plane part taken from such a map is wild. The lens matters more than a pose like that.
+    """
+    wild = lens[0] > _STRONG_PINCUSHION and np.abs(pose - np.eye(3)).max() > _STRONG_POSE
+    return np.eye(3) if wild else pose
 
 
 def _unchanged(guides: Guides, error: float, chains: int) -> Refinement:
