@@ -266,4 +266,4 @@ def test_a_device_that_is_not_there_names_those_that_are() -> None:
     finding = graphics_of(Path("/"), egl_device=200, renderer="cpu")["EGL devices"]
 
     assert finding.status == "note"
-    assert "UNBEND_EGL_DEVICE to 0.." in finding.remedy
+    assert "UNBEND_EGL_DEVICE to 0" in finding.remedy

@@ -84,14 +84,14 @@ def _devices(settings: Settings, needed: bool, sandbox: Sandbox, root: Path) -> 
     try:
         devices = sandbox.ask(list_devices)
     except OSError as error:
-        return Finding("EGL devices", bad, str(error), f"{_INSTALL}; {_CPU_WORKS}")
+        return Finding("EGL devices", bad, str(error), _remedy(needed, root))
     if not devices:
-        remedy = _NVIDIA if _has_nvidia(root) else f"{_INSTALL}; {_CPU_WORKS}"
-        return Finding("EGL devices", bad, "libEGL lists none", remedy)
+        return Finding("EGL devices", bad, "libEGL lists none", _remedy(needed, root))
     detail = "; ".join(_describe(device) for device in devices)
     if settings.egl_device >= len(devices):
+        choice = "0" if len(devices) == 1 else f"0..{len(devices) - 1}"
         wrong = f"there is no device {settings.egl_device}: {detail}"
-        return Finding("EGL devices", bad, wrong, f"set UNBEND_EGL_DEVICE to 0..{len(devices) - 1}")
+        return Finding("EGL devices", bad, wrong, f"set UNBEND_EGL_DEVICE to {choice}")
     if locked := _locked_nodes(root):
         return Finding("EGL devices", "note", f"{detail}; no access to {', '.join(locked)}", _NODES)
     return Finding("EGL devices", "ok", detail)
@@ -112,8 +112,7 @@ def _renderer(settings: Settings, needed: bool, sandbox: Sandbox, root: Path) ->
     try:
         hardware, device = sandbox.ask(_open_egl, settings.egl_device)
     except OSError as error:
-        remedy = _NVIDIA if _has_nvidia(root) else f"{_INSTALL}; {_CPU_WORKS}"
-        return Finding("renderer", "bad" if needed else "note", f"no EGL context: {error}", remedy)
+        return Finding("renderer", "bad" if needed else "note", f"no EGL context: {error}", _remedy(needed, root))
     if hardware:
         return Finding("renderer", "ok", f"egl on {device}")
     if settings.require_gpu:
@@ -134,6 +133,13 @@ def _open_egl(device: int) -> tuple[bool, str]:
     info = renderer.info
     renderer.close()
     return info.hardware, info.device
+
+
+def _remedy(needed: bool, root: Path) -> str:
+    """What helps where EGL gives nothing."""
+    if _has_nvidia(root):
+        return _NVIDIA
+    return f"mend what the lines above name, or {_INSTALL}" if needed else f"{_INSTALL}; {_CPU_WORKS}"
 
 
 def _load(library: str) -> None:
