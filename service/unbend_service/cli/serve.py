@@ -21,7 +21,7 @@ def serve(
     model: Annotated[str | None, typer.Option(help="Name of a shipped model, or a path.")] = None,
     workers: Annotated[int | None, typer.Option(help="Render workers; 0: one a core [default: 0].")] = None,
 ) -> None:
-    """Serve HTTP and gRPC until SIGTERM. Every setting is also an environment variable UNBEND_...; see docs/configuration.md."""
+    """Serve HTTP and gRPC until SIGTERM. Every setting is also a variable UNBEND_...; see docs/configuration.md."""
     chosen: dict[str, Any] = {
         "http_host": host,
         "grpc_host": host,
