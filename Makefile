@@ -66,9 +66,9 @@ docs: setup-dev  ## Write the table of docs/configuration.md
 .PHONY: docs
 
 MACHINE ?= $(shell hostname)
-BENCHES := bench-render bench-stream bench-http bench-estimate bench-startup
+BENCHES := bench-render bench-stream bench-http bench-estimate bench-startup bench-scale
 
-$(BENCHES): bench-%: setup-dev
+$(BENCHES) bench-memory: bench-%: setup-dev
 	$(BIN)/python -m benchmarks $* --json benchmarks/results/$(MACHINE)/$*.json
 
 bench-render:  ## Measure the renderers beside bare remap and moderngl (MACHINE names the results)
@@ -76,9 +76,11 @@ bench-stream:  ## Measure streams beside a bare echo, one process, ffmpeg
 bench-http:  ## Measure HTTP beside the same work in process
 bench-estimate:  ## Measure round trips of estimates
 bench-startup:  ## Measure the start of the service and the import of the client
+bench-scale:  ## Measure sizes from 256 x 256 to 7680 x 4320, and up to 10,000 grids
+bench-memory:  ## Watch the memory of every process for 30 minutes of mixed load
 bench: $(BENCHES) bench-summary  ## Measure everything
 
 bench-summary: setup-dev  ## Write the results into benchmarks/README.md
 	$(BIN)/python -m benchmarks summary
 
-.PHONY: bench bench-summary $(BENCHES)
+.PHONY: bench bench-summary bench-memory $(BENCHES)

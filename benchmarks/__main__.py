@@ -6,9 +6,17 @@ import argparse
 import sys
 from pathlib import Path
 
-from benchmarks import estimate, http_load, parity, render, startup, stream, summary
+from benchmarks import estimate, http_load, memory, parity, render, scale, startup, stream, summary
 
-SUITES = {"render": render, "estimate": estimate, "http": http_load, "startup": startup, "stream": stream}
+SUITES = {
+    "render": render,
+    "estimate": estimate,
+    "http": http_load,
+    "startup": startup,
+    "stream": stream,
+    "scale": scale,
+    "memory": memory,
+}
 
 
 def main() -> int:
