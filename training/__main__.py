@@ -79,6 +79,7 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--name", default="run-cooled")
     export.add_argument("--weights", type=Path, default=Path("service/unbend_service/models/lineset.onnx"))
     export.add_argument("--calibration", type=Path, help="the .json that `calibrate` wrote")
+    export.add_argument("--min-confidence", type=float, default=0.8, help="threshold that the card advises")
     export.set_defaults(verb=_export)
 
     calibrate = verbs.add_parser("calibrate", help="fit the confidence of a checkpoint on training photographs")
@@ -172,7 +173,7 @@ def _export(arguments: argparse.Namespace) -> None:
     if arguments.calibration is not None:
         confidence = tuple(json.loads(arguments.calibration.read_text())["weights"])
     checkpoint = Checkpoint.load(arguments.directory / f"{arguments.name}.pt")
-    difference = export(checkpoint, arguments.weights, confidence=confidence)
+    difference = export(checkpoint, arguments.weights, confidence=confidence, min_confidence=arguments.min_confidence)
     print(f"{arguments.weights}: {checkpoint.samples} samples, differs from torch by {difference:.1e}")
 
 

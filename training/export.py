@@ -31,6 +31,7 @@ def export(
     name: str = "lineset",
     confidence: tuple[float, ...] = UNCALIBRATED,
     looks: int = LOOKS,
+    min_confidence: float = 0.0,
 ) -> float:
     """Writes `weights` (.onnx) and the .json card beside it; returns the largest difference from torch.
 
@@ -61,7 +62,7 @@ def export(
     difference = parity(network, weights)
     if difference > PARITY_TOLERANCE:
         raise RuntimeError(f"ONNX Runtime differs from torch by {difference:.2e}.")
-    write_card(weights, name, confidence, looks)
+    write_card(weights, name, confidence, looks, min_confidence)
     return difference
 
 
@@ -78,12 +79,13 @@ def parity(network: LinesetNetwork, weights: Path) -> float:
     return worst
 
 
-def write_card(weights: Path, name: str, confidence: tuple[float, ...], looks: int) -> None:
+def write_card(weights: Path, name: str, confidence: tuple[float, ...], looks: int, min_confidence: float) -> None:
     """The .json beside the weights, as `unbend_service.adapters.estimators.cards` reads it."""
     card: dict[str, Any] = {
         "name": name,
         "kind": "lineset",
         "sha256": hashlib.sha256(weights.read_bytes()).hexdigest(),
+        "min_confidence": min_confidence,
         "parameters": {
             "nodes": NODES.tolist(),
             "anchors": ANCHORS.tolist(),
