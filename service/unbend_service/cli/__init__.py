@@ -10,6 +10,7 @@ from unbend_service.cli.doctor import doctor
 from unbend_service.cli.estimate import estimate
 from unbend_service.cli.grid import grid
 from unbend_service.cli.serve import serve
+from unbend_service.cli.show import show
 from unbend_service.cli.video import video
 
 app = typer.Typer(
@@ -19,7 +20,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for verb in (serve, correct, video, estimate, annotate, doctor):
+for verb in (serve, correct, video, show, estimate, annotate, doctor):
     app.command()(verb)
 app.add_typer(grid)
 

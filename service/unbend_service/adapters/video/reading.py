@@ -74,9 +74,9 @@ class PyavReader:
         if self.stream.frames:
             return int(self.stream.frames)
         if self.stream.duration and self.stream.time_base:
-            return round(self.stream.duration * self.stream.time_base * self.rate)
+            return int(self.stream.duration * self.stream.time_base * self.rate + Fraction(1, 2))
         if self.container.duration:
-            return round(self.container.duration / 1_000_000 * self.rate)
+            return int(Fraction(self.container.duration, 1_000_000) * self.rate + Fraction(1, 2))
         return None
 
     def read(self) -> Sequence[Picture | Passenger]:

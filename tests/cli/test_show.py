@@ -1,0 +1,60 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from xml.etree import ElementTree
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from tests.fakes import barrel_guides
+from unbend_service.cli import app
+from unbend_service.domain.grid import Grid
+from unbend_service.domain.records import GridRecord
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("UNBEND_RENDERER", "cpu")
+    y, x = np.mgrid[0:240, 0:320]
+    squares = np.repeat(((x // 20 + y // 20) % 2 * 200 + 20)[..., None], 3, 2).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "in.png"), squares)
+    record = GridRecord(Grid.from_map(barrel_guides(), 33, 33), barrel_guides())
+    (tmp_path / "grid.json").write_text(json.dumps(record.to_dict()))
+    return tmp_path
+
+
+def run(folder: Path, *arguments: str, code: int = 0) -> str:
+    source, grid = str(folder / "in.png"), str(folder / "grid.json")
+    result = CliRunner().invoke(app, ["show", source, *arguments, "--grid", grid])
+    assert result.exit_code == code, result.output
+    return result.output
+
+
+@pytest.mark.parametrize("what", ["guides", "grid", "grids", "displacement", "magnitude", "sheet"])
+def test_each_figure_is_a_picture(folder: Path, what: str) -> None:
+    """Every figure is drawn, differs from the photograph, and is large enough to hold it."""
+    run(folder, str(folder / "out.png"), "--what", what)
+    figure = cv2.imread(str(folder / "out.png"))
+    assert figure.shape[0] >= 240
+    assert figure.shape[1] >= 320
+    assert np.abs(figure[:240, :320].astype(int) - cv2.imread(str(folder / "in.png"))).max() > 20 or what == "sheet"
+
+
+@pytest.mark.parametrize(("what", "lines"), [("guides", 8), ("grid", 34)])
+def test_svg_holds_lines_that_can_be_scaled(folder: Path, what: str, lines: int) -> None:
+    """The photograph is embedded; each curve is a halo and a core."""
+    run(folder, str(folder / "out.svg"), "--what", what)
+    tree = ElementTree.parse(folder / "out.svg")
+    name = "{http://www.w3.org/2000/svg}"
+    assert len(tree.findall(f".//{name}polyline")) == 2 * lines
+    assert len(tree.findall(f"{name}image")) == 1
+
+
+def test_mistakes_are_sentences(folder: Path) -> None:
+    (folder / "taken.png").write_bytes(b"mine")
+    assert "--overwrite" in run(folder, str(folder / "taken.png"), code=2)
+    assert ".png" in run(folder, str(folder / "out.gif"), code=3)
+    assert "SVG" in run(folder, str(folder / "out.svg"), "--what", "sheet", code=3)
