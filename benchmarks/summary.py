@@ -82,7 +82,7 @@ def plot(suites: list[dict[str, Any]]) -> str:
         relation, bar = ratio["bar"].split()
         share = ratio["value"] / float(bar) if float(bar) else 1.0 + ratio["value"]
         top = number * _ROW_PX + 4
-        length = min(share, _LARGEST) * unit
+        length = min(max(share, 0.0), _LARGEST) * unit
         parts.append(
             f'<text x="{_LABEL_PX - 8}" y="{top + 13}" text-anchor="end">{label.replace("<", "&lt;")}</text>'
             f'<rect x="{_LABEL_PX}" y="{top}" width="{length:.0f}" height="{_ROW_PX - 8}" '
