@@ -26,7 +26,7 @@ from unbend_service.settings import Settings
 
 PICTURES = Path(__file__).parent / "pictures"
 #: Division model coefficient in the frame where the half diagonal of the picture is 1.
-BEND = 0.22
+BEND = 0.3
 #: Width of a figure, and its share of JPEG's quality: what keeps it under 200 kB.
 FIGURE_PX, FIGURE_QUALITY = 840, 80
 

@@ -35,13 +35,17 @@ class Settings(BaseSettings):
     queue_frames: int = Field(64, ge=1, description="Frames that may wait for a renderer; one more is refused.")
     render_deadline_s: float = Field(30.0, gt=0, description="Longest time from acceptance to answer of one frame.")
 
-    model: str = Field("first", description="Estimator: the name of a model that ships, or a path to one.")
+    model: str = Field("lineset", description="Estimator: the name of a model that ships, or a path to one.")
     estimator_threads: int = Field(0, ge=0, le=256, description="Threads of one estimate; 0: as many as usable cores.")
     known_images: int = Field(
         1024, ge=0, description="Pictures whose estimate is kept, so that the same picture is not looked at twice."
     )
-    min_confidence: float = Field(
-        0.0, ge=0, le=1, description="Below this confidence a picture is left alone, unless the request says otherwise."
+    min_confidence: float | None = Field(
+        None,
+        ge=0,
+        le=1,
+        description="Below this confidence a picture is left alone, unless the request says otherwise; "
+        "unset: what the model's card advises, for its lens.",
     )
     grid_points: int = Field(65, ge=9, le=257, description="Rows and columns of the grids that are made.")
 

@@ -32,6 +32,8 @@ class Estimation:
     A picture that was seen before, or is being looked at, is not looked at again.
 
     Args:
+        min_confidence: below which a picture is left alone; None takes the estimator's advice, which speaks of the lens
+            and is therefore not followed where the whole of the map was asked for.
         known_images: pictures whose estimate is kept.
     """
 
@@ -45,7 +47,7 @@ class Estimation:
         meter: Meter,
         *,
         grid_points: int,
-        min_confidence: float,
+        min_confidence: float | None,
         known_images: int = 1024,
     ) -> None:
         self._known: Known[Estimate] = Known(known_images)
@@ -64,7 +66,7 @@ class Estimation:
 
     async def record(self, estimate: Estimate, correct: Correct, min_confidence: float | None = None) -> GridRecord:
         """The decision on an estimate, at full strength and without fit; stored and counted."""
-        threshold = self._min_confidence if min_confidence is None else check_confidence(min_confidence)
+        threshold = self._threshold(estimate, correct, min_confidence)
         record = await self._blocking.run(
             "grid",
             decide,
@@ -79,6 +81,13 @@ class Estimation:
         self._meter.estimate(record.outcome.value)
         await self._store.put(record)
         return record
+
+    def _threshold(self, estimate: Estimate, correct: Correct, asked: float | None) -> float:
+        if asked is not None:
+            return check_confidence(asked)
+        if self._min_confidence is not None:
+            return self._min_confidence
+        return estimate.model.min_confidence if correct is Correct.NONLINEAR else 0.0
 
     async def of_image(
         self,

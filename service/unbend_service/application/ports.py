@@ -25,10 +25,12 @@ class ModelInfo:
     Attributes:
         name: short name, as the setting ``model`` takes it.
         sha256: of the weight file, lower-case hex.
+        min_confidence: 0..1, below which its card advises to leave a picture's lens alone.
     """
 
     name: str
     sha256: str
+    min_confidence: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

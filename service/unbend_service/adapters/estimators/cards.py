@@ -1,7 +1,8 @@
 """Model cards: what a weight file is, read from the ``.json`` that lies beside it.
 
-A card is ``{"name", "kind", "sha256", "parameters"}``: ``kind`` says which estimator reads the weights, ``sha256`` is
-that of the ``.onnx`` file, ``parameters`` are the estimator's own.
+A card is ``{"name", "kind", "sha256", "min_confidence", "parameters"}``: ``kind`` says which estimator reads the
+weights, ``sha256`` is that of the ``.onnx`` file, ``min_confidence`` (0 if left out) is the advised threshold, and
+``parameters`` are the estimator's own.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ class ModelCard:
         name: as the setting ``model`` takes it.
         kind: which estimator reads the weights, a key of the catalogue.
         sha256: of the weight file, lower-case hex.
+        min_confidence: 0..1, below which a picture's lens had better be left alone.
         parameters: what that estimator wants to know besides.
         weights: the ``.onnx`` file.
     """
@@ -33,6 +35,7 @@ class ModelCard:
     name: str
     kind: str
     sha256: str
+    min_confidence: float
     parameters: dict[str, Any]
     weights: Path
 
@@ -63,6 +66,7 @@ def read_card(model: str) -> ModelCard:
             name=str(fields["name"]),
             kind=str(fields["kind"]),
             sha256=str(fields["sha256"]),
+            min_confidence=float(fields.get("min_confidence", 0.0)),
             parameters=dict(fields.get("parameters", {})),
             weights=weights,
         )

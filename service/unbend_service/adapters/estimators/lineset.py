@@ -96,7 +96,7 @@ class LinesetEstimator:
                 f"The weights of {card.name!r} take {features} and give {values}, not what the card says.",
                 setting="model",
             )
-        self._model = ModelInfo(card.name, card.sha256)
+        self._model = ModelInfo(card.name, card.sha256, card.min_confidence)
 
     @property
     def model(self) -> ModelInfo:

@@ -9,7 +9,13 @@ function trust({ confidence, confidence_kind: kind }) {
 }
 
 const ALONE = {
-  low_confidence: ["Left as it is", (record) => `The distortion could not be told with enough certainty (${percent(record.confidence)}), and a wrong correction is worse than none.`],
+  low_confidence: [
+    "Left as it is",
+    (record) =>
+      record.confidence_kind === "calibrated_probability"
+        ? `A correction would make this picture better with a probability of only ${percent(record.confidence)}, and a wrong correction is worse than none.`
+        : `The distortion could not be told with enough certainty (${percent(record.confidence)}), and a wrong correction is worse than none.`,
+  ],
   nothing_to_correct: ["Left as it is", () => "Nothing in this picture is bent by more than a fraction of a pixel, so nothing was changed."],
   folded: ["Left as it is", () => "The estimated correction would fold the picture over itself, so nothing was changed."],
 };
