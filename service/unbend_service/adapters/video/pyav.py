@@ -15,7 +15,9 @@ def load_av() -> Any:
         import av
     except ImportError as error:
         raise Unavailable("PyAV is not installed here.", allowed="pip install 'unbend[video]'") from error
-    av.logging.set_level(av.logging.ERROR)
+    # PyAV's log must stay off, as it is by default: its callback takes the GIL in FFmpeg's threads, which a decoder
+    # that is being freed waits for while it holds the GIL
+    av.logging.set_level(None)
     return av
 
 
