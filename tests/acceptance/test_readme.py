@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -70,11 +71,30 @@ def test_no_picture_is_large() -> None:
         assert picture.stat().st_size < 200_000, picture.name
 
 
-@pytest.mark.parametrize("snippet", all_snippets("sh"))
-def test_shell_snippets_work_as_they_stand(server: Server, tmp_path: Path, snippet: str) -> None:
+def lay_out(folder: Path) -> None:
+    """What the snippets find beside them: photo.jpg, photographs/, ride.mp4 and a camera's calibration.yml."""
     rng = np.random.default_rng(3)
     picture = cv2.resize(rng.integers(0, 255, (12, 16, 3), dtype=np.uint8), (640, 480))
-    cv2.imwrite(str(tmp_path / "photo.jpg"), picture)
+    cv2.imwrite(str(folder / "photo.jpg"), picture)
+    (folder / "photographs").mkdir()
+    cv2.imwrite(str(folder / "photographs/first.jpg"), picture)
+    with av.open(str(folder / "ride.mp4"), "w") as film:
+        stream = film.add_stream("mpeg4", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 640, 480, "yuv420p"
+        for _ in range(8):
+            film.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")))
+        film.mux(stream.encode())
+    calibration = cv2.FileStorage(str(folder / "calibration.yml"), cv2.FILE_STORAGE_WRITE)
+    calibration.write("image_width", 640)
+    calibration.write("image_height", 480)
+    calibration.write("camera_matrix", np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]))
+    calibration.write("distortion_coefficients", np.array([[-0.2, 0.03, 0, 0, 0]]))
+    calibration.release()
+
+
+@pytest.mark.parametrize("snippet", all_snippets("sh"))
+def test_shell_snippets_work_as_they_stand(server: Server, tmp_path: Path, snippet: str) -> None:
+    lay_out(tmp_path)
     ready = snippet.replace("localhost:8080", server.http).replace(".venv/bin/unbend", f"{sys.executable} -m unbend")
     ready = ready.replace("python3 -c", f"{sys.executable} -c").replace("curl -sS", "curl -sS --fail-with-body")
     # the doctor is to look at free ports, whatever else runs on this machine
