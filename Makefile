@@ -84,3 +84,22 @@ bench-summary: setup-dev  ## Write the results into benchmarks/README.md
 	$(BIN)/python -m benchmarks summary
 
 .PHONY: bench bench-summary bench-memory $(BENCHES)
+
+TRAINING = OMP_NUM_THREADS=1 $(BIN)/python -m training --photos $(PHOTOS)
+
+train: $(VENV)/.training  ## Go on with the long training run (training/README.md); stop it with Ctrl-C
+	test -f $(HOME)/.cache/unbend/training/chains.npz || $(TRAINING) store
+	$(TRAINING) train
+
+train-smoke: $(VENV)/.training  ## A minute of training, resuming and exporting, on drawn pictures
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/training
+
+export: $(VENV)/.training  ## Cool the run down for half an hour, calibrate it, and write ONNX and card
+	$(TRAINING) cooldown --minutes 30
+	$(TRAINING) calibrate
+	$(TRAINING) export --calibration $(HOME)/.cache/unbend/training/run-cooled-calibration.json
+
+evaluate: $(VENV)/.training  ## Print the accuracy tables of the default model over the validation photographs
+	$(TRAINING) evaluate --weights service/unbend_service/models/lineset.onnx --limit 150 --threshold 0.8
+
+.PHONY: train train-smoke export evaluate

@@ -25,9 +25,7 @@ _FORMATS = {".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png", ".webp": "webp"}
 def correct(
     source: Annotated[
         str,
-        typer.Argument(
-            metavar="IN", help="A photograph: jpeg, png, webp, tiff, bmp; or a directory, or '**/*.jpg'."
-        ),
+        typer.Argument(metavar="IN", help="A photograph: jpeg, png, webp, tiff, bmp; or a directory, or '**/*.jpg'."),
     ],
     target: Annotated[
         Path, typer.Argument(metavar="OUT", help="Where to write it: .jpg, .png or .webp; for many, a directory.")
