@@ -1,7 +1,23 @@
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterator
+
+import pytest
+import structlog
 from hypothesis import settings
 
 # The time of an example is no property of the code on a shared machine, and a failure must come back on the next run.
 settings.register_profile("unbend", deadline=None, derandomize=True, max_examples=40)
 settings.load_profile("unbend")
+
+
+@pytest.fixture(autouse=True)
+def logs_as_they_were() -> Iterator[None]:
+    """Commands set logging up for their process, which is the tests' own where they are called in process."""
+    root = logging.getLogger()
+    handlers, level = list(root.handlers), root.level
+    yield
+    structlog.reset_defaults()
+    root.handlers[:] = handlers
+    root.setLevel(level)

@@ -30,11 +30,12 @@ def titled(headers: Message) -> dict[str, str]:
 
 def facade(width: int = 640, height: int = 480, bend: float = 0.25) -> np.ndarray:
     """(height, width, 3) uint8: rows of windows through a barrel lens (division model, frame of the half diagonal)."""
-    straight = np.full((2 * height, 2 * width, 3), 190, np.uint8)
-    for x in range(60, 2 * width - 80, 120):
-        for y in range(60, 2 * height - 120, 160):
-            cv2.rectangle(straight, (x, y), (x + 70, y + 110), (60, 50, 40), -1)
-            cv2.rectangle(straight, (x + 6, y + 6), (x + 64, y + 104), (150, 130, 110), 3)
+    drawn = np.full((round(1280 * height / width), 1280, 3), 190, np.uint8)
+    for x in range(60, drawn.shape[1] - 80, 120):
+        for y in range(60, drawn.shape[0] - 120, 160):
+            cv2.rectangle(drawn, (x, y), (x + 70, y + 110), (60, 50, 40), -1)
+            cv2.rectangle(drawn, (x + 6, y + 6), (x + 64, y + 104), (150, 130, 110), 3)
+    straight = cv2.resize(drawn, (2 * width, 2 * height))
     y, x = np.mgrid[0:height, 0:width].astype(np.float64)
     dx, dy = (x - width / 2 + 0.5) / (width / 2), (y - height / 2 + 0.5) / (width / 2)
     scale = 1 / (1 - bend * (dx**2 + dy**2) / (1 + (height / width) ** 2))

@@ -48,7 +48,8 @@ class GuidesView:
         the frame of the target: a point that is magnified counts less, one that leaves the frame hardly at all."""
         target = self._target.reshape(_LATTICE, _LATTICE, 2)
         step = 2 * self._extent / _LATTICE
-        down, right = np.gradient(target, step[1], axis=0), np.gradient(target, step[0], axis=1)
+        down = np.asarray(np.gradient(target, step[1], axis=0))
+        right = np.asarray(np.gradient(target, step[0], axis=1))
         area = np.abs(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]).clip(0.2, 5).ravel()
         reach = np.abs(self._target / self._extent).max(axis=1)
         shown = np.where(reach <= 1.06, 1.0, np.where(reach <= 1.35, 0.15, 0.02))
