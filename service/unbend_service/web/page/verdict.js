@@ -13,7 +13,7 @@ const ALONE = {
     "Left as it is",
     (record) =>
       record.confidence_kind === "calibrated_probability"
-        ? `A correction would make this picture better with a probability of only ${percent(record.confidence)}, and a wrong correction is worse than none.`
+        ? `The service is ${percent(record.confidence)} sure that a correction would make this picture better. That is less than it asks for, since a wrong correction is worse than none.`
         : `The distortion could not be told with enough certainty (${percent(record.confidence)}), and a wrong correction is worse than none.`,
   ],
   nothing_to_correct: ["Left as it is", () => "Nothing in this picture is bent by more than a fraction of a pixel, so nothing was changed."],
