@@ -60,7 +60,7 @@ parity: setup-dev  ## Compare the pictures of both renderers on ten photographs 
 
 .PHONY: parity
 
-docs: setup-dev  ## Write the table of docs/configuration.md
+docs: setup-dev  ## Write the tables of settings in README.md and docs/configuration.md
 	$(BIN)/python docs/settings.py
 
 .PHONY: docs

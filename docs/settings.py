@@ -1,4 +1,4 @@
-"""Writes the table of docs/configuration.md from the settings: ``python docs/settings.py``."""
+"""Writes the tables of README.md and docs/configuration.md from the settings: ``python docs/settings.py``."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 from unbend_service.settings import settings_table
 
-PAGE = Path(__file__).parent / "configuration.md"
+PAGES = (Path(__file__).parent.parent / "README.md", Path(__file__).parent / "configuration.md")
 START, END = "<!-- settings -->\n", "<!-- /settings -->"
 
 
@@ -18,4 +18,5 @@ def with_table(page: str) -> str:
 
 
 if __name__ == "__main__":
-    PAGE.write_text(with_table(PAGE.read_text()))
+    for page in PAGES:
+        page.write_text(with_table(page.read_text()))
