@@ -41,7 +41,7 @@ def clock() -> Clock:
 
 
 @pytest.fixture(params=[MemoryGridStore, SqliteGridStore], ids=["memory", "sqlite"])
-async def store(request: pytest.FixtureRequest, tmp_path: Path, clock: Clock):  # type: ignore[no-untyped-def]
+async def store(request: pytest.FixtureRequest, tmp_path: Path, clock: Clock):
     settings = Settings(grid_store_entries=ENTRIES, grid_store_ttl_s=TTL_S, grid_store_path=tmp_path / "grids.sqlite3")
     built: GridStore = request.param(settings, clock)
     yield built

@@ -31,7 +31,7 @@ def test_records_survive_json(
     guides: object, confidence: float, kind: str, outcome: Outcome, reason: Reason, strength: float, model: str
 ) -> None:
     """Whatever was decided of an estimate comes back from JSON exactly, and under the same id."""
-    record = GridRecord(GRID, guides, confidence, kind, outcome, reason, strength, model)  # type: ignore[arg-type]
+    record = GridRecord(GRID, guides, confidence, kind, outcome, reason, strength, model)
     again = GridRecord.from_dict(json.loads(json.dumps(record.to_dict())))
     assert again.to_dict() == record.to_dict()
     assert again.id == record.id == GRID.id

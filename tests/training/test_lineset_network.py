@@ -25,7 +25,7 @@ SQUARE = np.ones((1, 2))
 def truth_of(distortion: object) -> tuple[torch.Tensor, Truth]:
     """Fitted labels and the truth of a batch of one, square."""
     x, y = evaluation_points(SQUARE)
-    s, t = distortion.straighten(x, y)  # type: ignore[attr-defined]
+    s, t = distortion.straighten(x, y)
     weight = evaluation_weights(s, t, np.ones_like(s), SQUARE)
     source, target = (torch.tensor(np.stack(p, -1), dtype=torch.float32) for p in ((x, y), (s, t)))
     slopes = torch.eye(2).expand(1, x.shape[1], 2, 2)
@@ -43,7 +43,7 @@ def test_straight_guides_are_right_about_an_undistorted_picture() -> None:
 @pytest.mark.parametrize("lens", [{"division": -0.15}, {"wave": (0.2, 0.0)}, {"division": 0.2}])
 def test_fitted_labels_describe_the_map(lens: dict[str, float]) -> None:
     """K = 4 guides of degree 5 fit a lens to half a pixel where doing nothing costs several."""
-    labels, truth = truth_of(fixed_distortion(**lens))  # type: ignore[arg-type]
+    labels, truth = truth_of(fixed_distortion(**lens))
     nothing = torch.tensor(STRAIGHT, dtype=torch.float32)[None]
     assert truth.errors(labels)[0].item() < 0.5
     assert truth.errors(nothing)[0].item() > 3

@@ -367,7 +367,7 @@ def test_packed_frames_are_written(pixel_format: PixelFormat, image_format: str)
     data[:, :] = {1: [90], 3: [200, 90, 10], 4: [200, 90, 10, 255]}[data.shape[1]]
     image = DecodedImage(Frame(pixel_format, 8, 8, data.reshape(-1)), image_format)
     body = CODEC.encode(image, image_format, 95)
-    red, green, blue = Image.open(io.BytesIO(body)).convert("RGB").getpixel((4, 4))  # type: ignore[misc]
+    red, green, blue = Image.open(io.BytesIO(body)).convert("RGB").getpixel((4, 4))
     first, last = (90, 90) if pixel_format is PixelFormat.GRAY8 else (200, 10)
     if pixel_format in (PixelFormat.BGR24, PixelFormat.BGRA):
         first, last = last, first

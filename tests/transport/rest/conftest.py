@@ -109,7 +109,7 @@ def chequers(width: int = 160, height: int = 120) -> Image.Image:
 
 def encoded(image: Image.Image, image_format: str, **options: object) -> bytes:
     out = io.BytesIO()
-    image.save(out, image_format, **options)  # type: ignore[arg-type]
+    image.save(out, image_format, **options)
     return out.getvalue()
 
 

@@ -39,7 +39,7 @@ async def test_an_announced_length_is_refused_before_it_is_read(bench: Bench) ->
         "query_string": b"",
         "headers": [(b"content-length", str(LIMIT + 1).encode())],
     }
-    await bench.app(scope, receive, send)  # type: ignore[arg-type]
+    await bench.app(scope, receive, send)
     assert messages[0]["status"] == 413
     assert received == 0
 
@@ -67,7 +67,7 @@ async def test_an_unannounced_length_is_refused_as_soon_as_it_is_exceeded(bench:
         "query_string": b"",
         "headers": [],
     }
-    await bench.app(scope, receive, send)  # type: ignore[arg-type]
+    await bench.app(scope, receive, send)
     assert messages[0]["status"] == 413
     assert received == 4
 
@@ -126,5 +126,5 @@ async def test_a_caller_who_leaves_is_counted_apart(bench: Bench) -> None:
         "query_string": b"",
         "headers": [],
     }
-    await bench.app(scope, receive, send)  # type: ignore[arg-type]
+    await bench.app(scope, receive, send)
     assert 'code="499"' in (await bench.client.get("/metrics")).text

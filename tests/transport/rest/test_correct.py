@@ -144,7 +144,7 @@ async def test_the_border_is_painted(client: httpx.AsyncClient) -> None:
     clear = opened(await client.post(f"{query}&border=transparent", content=body))
     assert clear.mode == "RGBA"
     assert clear.getpixel((1, 1)) == (0, 0, 0, 0)
-    assert clear.getpixel((80, 60))[3] == 255  # type: ignore[index]
+    assert clear.getpixel((80, 60))[3] == 255
     refused = await client.post(f"{query}&border=transparent&format=jpeg", content=body)
     assert (refused.status_code, refused.json()["code"]) == (422, "invalid_option")
 
@@ -182,7 +182,7 @@ async def test_a_bad_body_is_named_and_the_service_still_serves(
     """Every kind of bad picture has its own status and code, and the next good one is answered."""
     body, status, code = BAD_BODIES[name]
     for content in ({"content": body}, {"files": {"image": ("x", body, "image/jpeg")}}):
-        response = await client.post(path, **content)  # type: ignore[arg-type]
+        response = await client.post(path, **content)
         assert (response.status_code, response.json()["code"]) == (status, code)
     assert (await client.post(path, content=jpeg)).status_code == 200
 
