@@ -134,7 +134,8 @@ class Guides:
 
         Where they touch instead of crossing the map folds; what Newton finds behind that is another branch.
         """
-        row, column = self.rows.at(points[:, 1]), self.columns.at(points[:, 0])
+        row = np.ascontiguousarray(self.rows.at(points[:, 1]).T)
+        column = np.ascontiguousarray(self.columns.at(points[:, 0]).T)
         x, y = points[:, 0].copy(), points[:, 1].copy()
         for _ in range(steps):
             row_y, row_slope = _polynomial(row, x)
@@ -226,13 +227,15 @@ def power_basis(argument: Float64, degree: int) -> Float64:
 
 
 def _polynomial(coefficients: Float64, argument: Float64) -> tuple[Float64, Float64]:
-    """Value and slope of one polynomial per point (n, degree + 1) at ``argument`` (n,), by Horner's rule."""
+    """Value and slope of one polynomial per point (degree + 1, n) at ``argument`` (n,), by Horner's rule."""
     inside = np.clip(argument, -TRUSTED_EXTENT, TRUSTED_EXTENT)
     value = np.zeros_like(inside)
     slope = np.zeros_like(inside)
-    for power in range(coefficients.shape[1] - 1, -1, -1):
-        slope = slope * inside + value
-        value = value * inside + coefficients[:, power]
+    for coefficient in coefficients[::-1]:
+        slope *= inside
+        slope += value
+        value *= inside
+        value += coefficient
     return value + slope * (argument - inside), slope
 
 

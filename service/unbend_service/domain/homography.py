@@ -8,6 +8,10 @@ from unbend_service.domain.errors import InvalidGrid
 from unbend_service.domain.maps import BackwardMap, Float64, target_lattice
 
 _LATTICE_POINTS = 33
+#: Points nearer to the horizon are put far out.
+_HORIZON = 1e-3
+#: Least eigenvalue of the normal equations, as a share of the greatest, with which they have one solution.
+_LEAST_RANK = 1e-12
 
 
 def apply_homography(matrix: Float64, points: Float64) -> Float64:
@@ -18,7 +22,7 @@ def apply_homography(matrix: Float64, points: Float64) -> Float64:
     """
     projected = points @ matrix[:, :2].T + matrix[:, 2]
     side = -1.0 if matrix[2, 2] < 0 else 1.0
-    return np.asarray(projected[..., :2] / (np.maximum(projected[..., 2:] * side, 1e-3) * side))
+    return np.asarray(projected[..., :2] / (np.maximum(projected[..., 2:] * side, _HORIZON) * side))
 
 
 def fit_homography(target: Float64, source: Float64, weights: Float64 | None = None) -> Float64:
@@ -37,32 +41,57 @@ def fit_homography(target: Float64, source: Float64, weights: Float64 | None = N
     Raises:
         InvalidGrid: the points do not determine a homography.
     """
-    x, y = target.T
-    u, v = source.T
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    equations = np.concatenate(
-        [
-            np.stack([x, y, one, zero, zero, zero, -u * x, -u * y], axis=1),
-            np.stack([zero, zero, zero, x, y, one, -v * x, -v * y], axis=1),
-        ]
-    )
-    right = np.concatenate([u, v])
-    base = np.ones_like(x) if weights is None else weights
+    products = _products(target, source)
+    homogeneous = np.stack([*target.T, np.ones(len(target))])
+    u, v = np.ascontiguousarray(source.T)
+    base = homogeneous[2] if weights is None else weights
     weight = base
     matrix = np.eye(3)
     for _ in range(12):
-        both = np.sqrt(np.concatenate([weight, weight]))
-        solution, _, rank, _ = np.linalg.lstsq(equations * both[:, None], right * both, rcond=None)
-        if rank < 8 or not np.isfinite(solution).all():
-            raise InvalidGrid("The map has no plane part: its points lie on a line.")
-        previous, matrix = matrix, np.append(solution, 1.0).reshape(3, 3)
+        previous, matrix = matrix, _solution(weight @ products)
         if np.abs(matrix - previous).max() < 1e-10:
             break
-        residual = np.hypot(*(apply_homography(matrix, target) - source).T)
-        scale = max(2.4 * float(np.median(residual)), 1e-6)
-        denominator = np.maximum(np.abs(matrix[2, 0] * x + matrix[2, 1] * y + 1), 0.1)
+        across, down, depth = matrix @ homogeneous
+        front = np.maximum(depth, _HORIZON)
+        residual = np.hypot(across / front - u, down / front - v)
+        scale = max(2.4 * _median(residual), 1e-6)
+        denominator = np.maximum(np.abs(depth), 0.1)
         weight = base / denominator**2 / (1 + (residual / scale) ** 2)
     return matrix
+
+
+def _products(target: Float64, source: Float64) -> Float64:
+    """(n, 36) float64: what each correspondence adds to the normal equations at weight 1.
+
+    With p = (x, y, 1) these are the 3 x 3 products p p^T times 1, u, v and u^2 + v^2. All numbers of the equations are
+    among them, so a round of reweighting is one product of a vector and a matrix, not a decomposition of 2n equations.
+    """
+    p = np.concatenate([target, np.ones((len(target), 1))], axis=1)
+    factors = np.concatenate([np.ones((len(target), 1)), source, (source**2).sum(axis=1, keepdims=True)], axis=1)
+    return np.asarray((factors[:, :, None, None] * (p[:, :, None] * p[:, None, :])[:, None]).reshape(-1, 36))
+
+
+def _solution(sums: Float64) -> Float64:
+    """The homography of the weighted sums of :func:`_products`; raises InvalidGrid."""
+    plain, by_u, by_v, by_square = sums.reshape(4, 3, 3)
+    normal, right = np.zeros((8, 8)), np.empty(8)
+    normal[:3, :3] = normal[3:6, 3:6] = plain
+    normal[:3, 6:], normal[3:6, 6:] = -by_u[:, :2], -by_v[:, :2]
+    normal[6:, :6] = normal[:6, 6:].T
+    normal[6:, 6:] = by_square[:2, :2]
+    right[:3], right[3:6], right[6:] = by_u[:, 2], by_v[:, 2], -by_square[:2, 2]
+    sizes = np.linalg.eigvalsh(normal) if np.isfinite(normal).all() else np.zeros(8)
+    if not sizes[0] > _LEAST_RANK * sizes[-1]:
+        raise InvalidGrid("The map has no plane part: its points lie on a line.")
+    return np.append(np.linalg.solve(normal, right), 1.0).reshape(3, 3)
+
+
+def _median(values: Float64) -> float:
+    """The median; np.median takes five times as long for a thousand numbers."""
+    middle = len(values) // 2
+    if len(values) % 2:
+        return float(np.partition(values, middle)[middle])
+    return float(np.partition(values, (middle - 1, middle))[middle - 1 : middle + 1].mean())
 
 
 def plane_part(backward: BackwardMap) -> Float64:
