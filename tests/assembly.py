@@ -8,6 +8,7 @@ from unbend_service.adapters.drawing.overlay import OverlayIllustrator
 from unbend_service.adapters.exchange.files import ExchangeFiles
 from unbend_service.adapters.grid_stores.memory import MemoryGridStore
 from unbend_service.application.blocking import BlockingWork
+from unbend_service.application.budget import MemoryBudget
 from unbend_service.application.correction import Correction
 from unbend_service.application.estimation import Estimation
 from unbend_service.application.exchange import Exchange
@@ -53,4 +54,5 @@ def service_over_fakes(settings: Settings, store: MemoryGridStore | None = None)
         meter=meter,
         blocking=blocking,
         model=FAKE_MODEL,
+        bodies=MemoryBudget(settings.bodies_bytes, "bodies_bytes"),
     )

@@ -27,12 +27,14 @@ if TYPE_CHECKING:
     from unbend._errors import GridConflict as GridConflict
     from unbend._errors import GridNotFound as GridNotFound
     from unbend._errors import GridStoreUnavailable as GridStoreUnavailable
+    from unbend._errors import ImageTooCostly as ImageTooCostly
     from unbend._errors import InvalidFrame as InvalidFrame
     from unbend._errors import InvalidGrid as InvalidGrid
     from unbend._errors import InvalidGuides as InvalidGuides
     from unbend._errors import InvalidImage as InvalidImage
     from unbend._errors import InvalidInput as InvalidInput
     from unbend._errors import InvalidOption as InvalidOption
+    from unbend._errors import MemoryFull as MemoryFull
     from unbend._errors import MissingPackage as MissingPackage
     from unbend._errors import ModelUnavailable as ModelUnavailable
     from unbend._errors import Overloaded as Overloaded
@@ -42,6 +44,7 @@ if TYPE_CHECKING:
     from unbend._errors import Refused as Refused
     from unbend._errors import RendererUnavailable as RendererUnavailable
     from unbend._errors import RenderFailed as RenderFailed
+    from unbend._errors import RequestStalled as RequestStalled
     from unbend._errors import ServerFault as ServerFault
     from unbend._errors import StreamEnded as StreamEnded
     from unbend._errors import StreamIdle as StreamIdle
@@ -81,12 +84,14 @@ _HOMES = {
         "GridConflict",
         "GridNotFound",
         "GridStoreUnavailable",
+        "ImageTooCostly",
         "InvalidFrame",
         "InvalidGrid",
         "InvalidGuides",
         "InvalidImage",
         "InvalidInput",
         "InvalidOption",
+        "MemoryFull",
         "MissingPackage",
         "ModelUnavailable",
         "Overloaded",
@@ -96,6 +101,7 @@ _HOMES = {
         "Refused",
         "RenderFailed",
         "RendererUnavailable",
+        "RequestStalled",
         "ServerFault",
         "StreamEnded",
         "StreamIdle",

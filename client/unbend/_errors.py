@@ -7,6 +7,7 @@ The tree; what stands in brackets is the builtin that the error also is::
     │   ├── EmptyBody
     │   ├── InvalidImage
     │   ├── TooManyPixels
+    │   ├── ImageTooCostly
     │   ├── UnsupportedMediaType
     │   ├── BodyTooLarge
     │   ├── InvalidOption
@@ -20,6 +21,7 @@ The tree; what stands in brackets is the builtin that the error also is::
     ├── GridConflict
     ├── Overloaded
     │   ├── QueueFull
+    │   ├── MemoryFull
     │   └── TooManyStreams
     ├── Unavailable [ConnectionError]
     │   ├── Draining
@@ -32,6 +34,7 @@ The tree; what stands in brackets is the builtin that the error also is::
     ├── StreamEnded
     │   ├── StreamTakenOver
     │   └── StreamIdle
+    ├── RequestStalled [TimeoutError]
     ├── DeadlineExceeded [TimeoutError]
     ├── Refused [PermissionError]  the server wants credentials, or others
     ├── ServerFault                the server failed, or does not speak unbend.v1
@@ -103,6 +106,12 @@ class TooManyPixels(InvalidInput):
     """More pixels than the server accepts."""
 
     code = "too_many_pixels"
+
+
+class ImageTooCostly(InvalidInput):
+    """Decoding the image takes more memory or time than the server grants."""
+
+    code = "image_too_costly"
 
 
 class UnsupportedMediaType(InvalidInput):
@@ -183,6 +192,12 @@ class QueueFull(Overloaded):
     code = "queue_full"
 
 
+class MemoryFull(Overloaded):
+    """The requests under way fill the memory that the server grants to all of them together."""
+
+    code = "memory_full"
+
+
 class TooManyStreams(Overloaded):
     """More streams are open than are allowed."""
 
@@ -253,6 +268,12 @@ class StreamIdle(StreamEnded):
     """No frame was sent and no answer taken for longer than the server allows."""
 
     code = "stream_idle"
+
+
+class RequestStalled(UnbendError, TimeoutError):
+    """What was sent came too slowly, or stopped."""
+
+    code = "request_stalled"
 
 
 class DeadlineExceeded(UnbendError, TimeoutError):

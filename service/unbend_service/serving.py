@@ -17,6 +17,7 @@ import uvicorn
 from unbend_service.application.service import Service
 from unbend_service.settings import Settings
 from unbend_service.transport.rest.app import create_app
+from unbend_service.transport.rest.connections import guarded_protocol
 from unbend_service.transport.rpc.server import start_server
 from unbend_service.wiring import build_service
 
@@ -56,7 +57,7 @@ async def serve(settings: Settings, on_ready: Callable[[Addresses], None] | None
         http_server = _HttpServer(
             uvicorn.Config(
                 create_app(service, settings),
-                http="httptools",
+                http=guarded_protocol(settings),
                 ws="none",
                 lifespan="off",
                 access_log=False,

@@ -50,9 +50,21 @@ class Settings(BaseSettings):
     grid_points: int = Field(65, ge=9, le=257, description="Rows and columns of the grids that are made.")
 
     body_bytes: int = Field(64 << 20, ge=1024, description="Largest request body; a larger one is refused with 413.")
+    bodies_bytes: int = Field(
+        512 << 20, ge=1024, description="Memory of all request bodies together; one more is refused with 429."
+    )
     source_pixels: int = Field(100_000_000, ge=1, description="Most pixels of a source image.")
     animation_frames: int = Field(1, ge=1, description="Most frames of an animated image.")
     jpeg_quality: int = Field(92, ge=1, le=100, description="Quality when the request names none.")
+
+    http_connections: int = Field(1024, ge=1, description="HTTP connections that may be open at once.")
+    http_header_bytes: int = Field(64 << 10, ge=1024, description="Largest request line and headers; more gets 431.")
+    http_header_s: float = Field(10.0, gt=0, description="Longest wait for a request line and headers.")
+    http_stall_s: float = Field(
+        15.0, gt=0, description="A body or an answer of which less than 16 KiB move in so long is given up."
+    )
+    grpc_calls: int = Field(1024, ge=1, description="gRPC calls and streams that may be under way at once.")
+    grpc_metadata_bytes: int = Field(16 << 10, ge=4096, description="Largest metadata of a gRPC call.")
 
     streams: int = Field(256, ge=1, description="Streams that may be open at once.")
     stream_in_flight: int = Field(8, ge=1, le=256, description="Frames of one stream that may be under way at once.")

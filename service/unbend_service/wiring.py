@@ -12,6 +12,7 @@ from unbend_service.adapters.grid_stores.sqlite import SqliteGridStore
 from unbend_service.adapters.metrics.prometheus import PrometheusMeter
 from unbend_service.adapters.renderers.pool import WorkerPool
 from unbend_service.application.blocking import BlockingWork
+from unbend_service.application.budget import MemoryBudget
 from unbend_service.application.correction import Correction
 from unbend_service.application.estimation import Estimation
 from unbend_service.application.exchange import Exchange
@@ -92,4 +93,5 @@ def build_service(settings: Settings, meter: PrometheusMeter | None = None) -> S
         meter,
         blocking,
         estimator.model,
+        MemoryBudget(settings.bodies_bytes, "bodies_bytes"),
     )

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from unbend_service.application.admission import Admission
 from unbend_service.application.blocking import BlockingWork
+from unbend_service.application.budget import MemoryBudget
 from unbend_service.application.correction import Correction
 from unbend_service.application.estimation import Estimation
 from unbend_service.application.exchange import Exchange
@@ -38,7 +39,7 @@ class Readiness:
 
 @dataclass(slots=True)
 class Service:
-    """Use cases and what they share."""
+    """Use cases and what they share; ``bodies`` bounds the request bodies in memory."""
 
     estimation: Estimation
     correction: Correction
@@ -52,6 +53,7 @@ class Service:
     meter: Meter
     blocking: BlockingWork
     model: ModelInfo
+    bodies: MemoryBudget
     admission: Admission = field(default_factory=Admission)
 
     async def start(self) -> None:

@@ -7,6 +7,7 @@ The tree (each leaf has a stable ``code``, which both transports put on the wire
     │   ├── EmptyBody
     │   ├── InvalidImage
     │   ├── TooManyPixels
+    │   ├── ImageTooCostly
     │   ├── UnsupportedMediaType
     │   ├── BodyTooLarge
     │   ├── InvalidOption
@@ -20,6 +21,7 @@ The tree (each leaf has a stable ``code``, which both transports put on the wire
     ├── GridConflict
     ├── Overloaded
     │   ├── QueueFull
+    │   ├── MemoryFull
     │   └── TooManyStreams
     ├── Unavailable
     │   ├── Draining
@@ -31,6 +33,7 @@ The tree (each leaf has a stable ``code``, which both transports put on the wire
     ├── StreamEnded
     │   ├── StreamTakenOver
     │   └── StreamIdle
+    ├── RequestStalled
     └── DeadlineExceeded
 
 The errors know neither HTTP nor gRPC: each transport owns one table from these classes to its own status codes.
@@ -98,6 +101,12 @@ class TooManyPixels(InvalidInput):
     """The image header announces more pixels than the service accepts."""
 
     code = "too_many_pixels"
+
+
+class ImageTooCostly(InvalidInput):
+    """Decoding the image takes more memory or time than the service grants."""
+
+    code = "image_too_costly"
 
 
 class UnsupportedMediaType(InvalidInput):
@@ -178,6 +187,12 @@ class QueueFull(Overloaded):
     code = "queue_full"
 
 
+class MemoryFull(Overloaded):
+    """The requests under way fill the memory that is granted to all of them together."""
+
+    code = "memory_full"
+
+
 class TooManyStreams(Overloaded):
     """More streams are open than are allowed."""
 
@@ -242,6 +257,12 @@ class StreamIdle(StreamEnded):
     """No frame came and no answer was taken for longer than is allowed."""
 
     code = "stream_idle"
+
+
+class RequestStalled(UnbendError, TimeoutError):
+    """The caller sends too slowly, or no more."""
+
+    code = "request_stalled"
 
 
 class DeadlineExceeded(UnbendError, TimeoutError):

@@ -16,6 +16,7 @@ from unbend_service.adapters.exchange.files import ExchangeFiles
 from unbend_service.adapters.grid_stores.memory import MemoryGridStore
 from unbend_service.adapters.metrics.prometheus import PrometheusMeter
 from unbend_service.application.blocking import BlockingWork
+from unbend_service.application.budget import MemoryBudget
 from unbend_service.application.correction import Correction
 from unbend_service.application.estimation import Estimation
 from unbend_service.application.exchange import Exchange
@@ -77,6 +78,7 @@ class Bench:
             meter=meter,
             blocking=blocking,
             model=self.estimator.model,
+            bodies=MemoryBudget(settings.bodies_bytes, "bodies_bytes"),
         )
         self.app = create_app(self.service, settings)
         self.client = httpx.AsyncClient(transport=httpx.ASGITransport(self.app), base_url="http://unbend")

@@ -5,6 +5,9 @@ from collections.abc import AsyncIterator
 import httpx
 import pytest
 
+from unbend_service.domain.errors import InvalidGrid
+from unbend_service.transport.rest.bodies import parse_json
+
 from .conftest import Bench
 
 LIMIT = 300_000
@@ -128,3 +131,45 @@ async def test_a_caller_who_leaves_is_counted_apart(bench: Bench) -> None:
     }
     await bench.app(scope, receive, send)
     assert 'code="499"' in (await bench.client.get("/metrics")).text
+
+
+async def test_bodies_share_the_memory_for_bodies(bench: Bench, jpeg: bytes) -> None:
+    """A body too many is told to come again, and what was held is free afterwards."""
+    budget = bench.service.bodies
+    with budget.holding() as holding:
+        holding.grow(bench.settings.bodies_bytes - len(jpeg) + 1)
+        announced = await bench.client.post("/v1/estimate", content=jpeg)
+        unannounced = await bench.client.post("/v1/estimate", content=pieces(jpeg))
+        form = await bench.client.post("/v1/estimate", files={"image": jpeg})
+    for refused in (announced, unannounced, form):
+        assert refused.status_code == 429
+        assert refused.json()["setting"] == "bodies_bytes"
+        assert int(refused.headers["retry-after"]) >= 1
+    assert (await bench.client.post("/v1/estimate", content=jpeg)).status_code == 200
+    assert budget.used_bytes == 0
+
+
+async def pieces(body: bytes) -> AsyncIterator[bytes]:
+    for first in range(0, len(body), 1000):
+        yield body[first : first + 1000]
+
+
+@pytest.mark.parametrize(
+    "body",
+    [b"[" * 1_200_000, b"[" + b"0," * 2_300_000 + b"0]", b"{" * 2000, b"[" * 100_000 + b"]" * 100_000],
+    ids=["lists", "numbers", "objects", "deep"],
+)
+def test_json_is_bounded_before_it_is_parsed(body: bytes) -> None:
+    """Lists in lists, and more numbers than any grid has, cost neither memory nor the stack."""
+    with pytest.raises(InvalidGrid):
+        parse_json(body)
+
+
+@pytest.mark.parametrize("charset", ["hex", "rot13", "zlib", "undefined", "idna", '""', "utf-16"])
+async def test_an_odd_charset_of_a_form_is_named_or_ignored(client: httpx.AsyncClient, charset: str) -> None:
+    """Python knows charsets that are none; no form may reach them."""
+    body = b'--x\r\nContent-Disposition: form-data; name="\xff\xfe."\r\n\r\n\xff..a\xc3\r\n--x--\r\n'
+    response = await client.post(
+        "/v1/correct", content=body, headers={"content-type": f"multipart/form-data; boundary=x; charset={charset}"}
+    )
+    assert response.status_code in (400, 422)

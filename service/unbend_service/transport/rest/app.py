@@ -12,6 +12,7 @@ from unbend_service.application.service import Service
 from unbend_service.settings import Settings
 from unbend_service.transport.rest import correct, estimate, exchange, grids, health, overlay, pages, problems
 from unbend_service.transport.rest.accounting import Accounting, Admitting
+from unbend_service.transport.rest.bodies import Bodies
 from unbend_service.transport.rest.parameters import refuse_unknown
 
 _DESCRIPTION = """Straightens what a lens has bent: a photograph from an unknown camera in, the straight picture out.
@@ -31,12 +32,13 @@ def create_app(service: Service, settings: Settings) -> FastAPI:
         dependencies=[Depends(refuse_unknown)],
     )
     problems.install(app)
+    bodies = Bodies(settings, service.bodies)
     for router in (
-        correct.router(service, settings),
-        estimate.router(service, settings),
-        overlay.router(service, settings),
-        grids.router(service, settings),
-        exchange.router(service, settings),
+        correct.router(service, bodies),
+        estimate.router(service, bodies),
+        overlay.router(service, bodies),
+        grids.router(service, bodies),
+        exchange.router(service, bodies),
         health.router(service),
         pages.router(),
     ):

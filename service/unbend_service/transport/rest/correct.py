@@ -12,9 +12,8 @@ from unbend_service.domain import errors
 from unbend_service.domain.fit import Fit
 from unbend_service.domain.frames import Border
 from unbend_service.domain.records import Correct
-from unbend_service.settings import Settings
 from unbend_service.transport.rest import parameters, problems
-from unbend_service.transport.rest.bodies import IMAGE_REQUEST_BODY, read_image
+from unbend_service.transport.rest.bodies import IMAGE_REQUEST_BODY, Bodies
 from unbend_service.transport.rest.provenance import HEADERS, headers_of
 
 #: What may go wrong whenever a picture is sent.
@@ -26,7 +25,10 @@ IMAGE_ERRORS = (
     errors.InvalidImage,
     errors.TooManyPixels,
     errors.InvalidOption,
+    errors.ImageTooCostly,
+    errors.RequestStalled,
     errors.QueueFull,
+    errors.MemoryFull,
     errors.Unavailable,
 )
 IMAGE_RESPONSE: dict[str, Any] = {
@@ -38,7 +40,7 @@ IMAGE_RESPONSE: dict[str, Any] = {
 }
 
 
-def router(service: Service, settings: Settings) -> APIRouter:
+def router(service: Service, bodies: Bodies) -> APIRouter:
     """The route over ``service``."""
     routes = APIRouter()
 
@@ -77,8 +79,8 @@ def router(service: Service, settings: Settings) -> APIRouter:
             grid_id=grid_id,
             min_confidence=min_confidence,
         )
-        body = await read_image(request, settings.body_bytes)
-        corrected = await service.correction.of_image(body, options)
+        async with bodies.image(request) as body:
+            corrected = await service.correction.of_image(body, options)
         headers = headers_of(corrected.record, corrected.record.strength * strength)
         return Response(corrected.body, media_type=f"image/{corrected.image_format}", headers=headers)
 

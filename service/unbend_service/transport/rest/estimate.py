@@ -8,14 +8,13 @@ from unbend_service.application.service import Service
 from unbend_service.domain import errors
 from unbend_service.domain.fit import Fit
 from unbend_service.domain.records import Correct
-from unbend_service.settings import Settings
 from unbend_service.transport.rest import parameters, problems
-from unbend_service.transport.rest.bodies import IMAGE_REQUEST_BODY, read_image
+from unbend_service.transport.rest.bodies import IMAGE_REQUEST_BODY, Bodies
 from unbend_service.transport.rest.correct import IMAGE_ERRORS
 from unbend_service.transport.rest.provenance import GridRecordBody, json_of
 
 
-def router(service: Service, settings: Settings) -> APIRouter:
+def router(service: Service, bodies: Bodies) -> APIRouter:
     """The route over ``service``."""
     routes = APIRouter()
 
@@ -39,7 +38,8 @@ def router(service: Service, settings: Settings) -> APIRouter:
         """Send the image file. The grid that comes back, and is stored under `grid_id`, is the one that `correct`,
         `fit` and `strength` describe; the guides are as estimated."""
         wanted = Fit.parse(fit)
-        body = await read_image(request, settings.body_bytes)
-        return json_of(await service.estimation.of_image(body, correct, wanted, strength, min_confidence))
+        async with bodies.image(request) as body:
+            record = await service.estimation.of_image(body, correct, wanted, strength, min_confidence)
+        return json_of(record)
 
     return routes

@@ -12,9 +12,8 @@ from unbend_service.domain.dense_maps import MAX_MAP_PIXELS
 from unbend_service.domain.exchange import Direction, ExportFormat, ExportOptions, ImportFormat, ImportOptions
 from unbend_service.domain.fit import Fit
 from unbend_service.domain.grid import MAX_POINTS
-from unbend_service.settings import Settings
 from unbend_service.transport.rest import parameters, problems
-from unbend_service.transport.rest.bodies import read_body
+from unbend_service.transport.rest.bodies import Bodies
 from unbend_service.transport.rest.grids import UPLOAD_ERRORS
 from unbend_service.transport.rest.provenance import GridRecordBody, json_of
 
@@ -64,7 +63,7 @@ _UPLOAD: dict[str, Any] = {
 }
 
 
-def router(service: Service, settings: Settings) -> APIRouter:
+def router(service: Service, bodies: Bodies) -> APIRouter:
     """The routes over ``service``."""
     routes = APIRouter(prefix="/v1/grids")
 
@@ -123,8 +122,8 @@ def router(service: Service, settings: Settings) -> APIRouter:
         points: PointsQuery = 129,
     ) -> Response:
         """From a file of another program; `direction` says which picture its map draws."""
-        body = await read_body(request, settings.body_bytes)
-        read = await service.exchange.read(body, format, ImportOptions(direction, points))
+        async with bodies.raw(request) as body:
+            read = await service.exchange.read(body, format, ImportOptions(direction, points))
         record = await service.grids.put_record(read)
         return json_of(record, 201, {"Location": f"/v1/grids/{record.id}"})
 

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import orjson
 from fastapi import APIRouter, Request, Response
 
 from unbend_service.application.service import Service
 from unbend_service.domain import errors
-from unbend_service.settings import Settings
 from unbend_service.transport.rest import parameters, problems
-from unbend_service.transport.rest.bodies import read_body
+from unbend_service.transport.rest.bodies import Bodies, parse_json
 from unbend_service.transport.rest.provenance import GridBody, GridRecordBody, GuidesBody, json_of
 
 _UPLOAD: dict[str, Any] = {
@@ -35,25 +33,22 @@ UPLOAD_ERRORS = (
     errors.InvalidGrid,
     errors.FoldedGrid,
     errors.InvalidGuides,
+    errors.RequestStalled,
     errors.QueueFull,
+    errors.MemoryFull,
     errors.Unavailable,
 )
 #: Named in OpenAPI though no route takes them as parsed models: large grids are parsed by orjson alone.
 COMPONENTS = (GridBody, GuidesBody)
 
 
-def router(service: Service, settings: Settings) -> APIRouter:
+def router(service: Service, bodies: Bodies) -> APIRouter:
     """The routes over ``service``."""
     routes = APIRouter(prefix="/v1/grids")
 
     async def read_json(request: Request) -> Any:
-        body = await read_body(request, settings.body_bytes)
-        try:
-            return await service.blocking.run("grid", orjson.loads, body)
-        except orjson.JSONDecodeError as error:
-            raise errors.InvalidGrid(
-                f"The body is not JSON: {error}.", allowed="RFC 8259 JSON, which has neither NaN nor Infinity"
-            ) from error
+        async with bodies.raw(request) as body:
+            return await service.blocking.run("grid", parse_json, body)
 
     @routes.post(
         "",

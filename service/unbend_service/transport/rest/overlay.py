@@ -10,9 +10,8 @@ from unbend_service.application.illustration import Subject
 from unbend_service.application.service import Service
 from unbend_service.domain import errors
 from unbend_service.domain.records import Correct
-from unbend_service.settings import Settings
 from unbend_service.transport.rest import parameters, problems
-from unbend_service.transport.rest.bodies import IMAGE_REQUEST_BODY, read_image
+from unbend_service.transport.rest.bodies import IMAGE_REQUEST_BODY, Bodies
 from unbend_service.transport.rest.correct import IMAGE_ERRORS, IMAGE_RESPONSE
 from unbend_service.transport.rest.provenance import headers_of
 
@@ -25,7 +24,7 @@ SubjectQuery = Annotated[
 ]
 
 
-def router(service: Service, settings: Settings) -> APIRouter:
+def router(service: Service, bodies: Bodies) -> APIRouter:
     """The route over ``service``."""
     routes = APIRouter()
 
@@ -47,8 +46,8 @@ def router(service: Service, settings: Settings) -> APIRouter:
         format: parameters.FormatQuery = None,
     ) -> Response:
         """Send the image file; the distorted picture comes back with the estimate drawn over it."""
-        body = await read_image(request, settings.body_bytes)
-        drawn = await service.illustration.of_image(body, what, correct, grid_id=grid_id, image_format=format)
+        async with bodies.image(request) as body:
+            drawn = await service.illustration.of_image(body, what, correct, grid_id=grid_id, image_format=format)
         headers = headers_of(drawn.record, drawn.record.strength)
         return Response(drawn.body, media_type=f"image/{drawn.image_format}", headers=headers)
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import uuid
 from collections.abc import Iterable, Mapping
+from http import HTTPStatus
 from typing import Any
 
 import orjson
@@ -24,6 +26,7 @@ TABLE: Mapping[type[errors.UnbendError], tuple[int, str]] = {
     errors.EmptyBody: (422, "Empty body"),
     errors.InvalidImage: (422, "Invalid image"),
     errors.TooManyPixels: (422, "Too many pixels"),
+    errors.ImageTooCostly: (422, "Image too costly"),
     errors.UnsupportedMediaType: (415, "Unsupported media type"),
     errors.BodyTooLarge: (413, "Body too large"),
     errors.InvalidOption: (422, "Invalid option"),
@@ -37,6 +40,7 @@ TABLE: Mapping[type[errors.UnbendError], tuple[int, str]] = {
     errors.GridConflict: (409, "Grid conflict"),
     errors.Overloaded: (429, "Overloaded"),
     errors.QueueFull: (429, "Queue full"),
+    errors.MemoryFull: (429, "Memory full"),
     errors.TooManyStreams: (429, "Too many streams"),
     errors.Unavailable: (503, "Unavailable"),
     errors.Draining: (503, "Draining"),
@@ -48,6 +52,7 @@ TABLE: Mapping[type[errors.UnbendError], tuple[int, str]] = {
     errors.StreamEnded: (409, "Stream ended"),
     errors.StreamTakenOver: (409, "Stream taken over"),
     errors.StreamIdle: (408, "Stream idle"),
+    errors.RequestStalled: (408, "Request stalled"),
     errors.DeadlineExceeded: (504, "Deadline exceeded"),
 }
 
@@ -104,6 +109,8 @@ def respond_to(error: errors.UnbendError, request_id: str) -> Response:
     headers = {}
     if status in (429, 503):
         headers["Retry-After"] = str(max(_RETRY_AFTER_S, math.ceil(error.retry_after_s or 0)))
+    if status == 408:
+        headers["Connection"] = "close"  # the rest of the body is not waited for
     return respond(
         request_id,
         status,
@@ -121,6 +128,19 @@ def respond_internal(request_id: str) -> Response:
     return respond(
         request_id, 500, "Internal error", errors.UnbendError.code, "The service failed; its log knows this request id."
     )
+
+
+def raw_problem(status: int, code: str, detail: str, setting: str) -> bytes:
+    """A whole HTTP/1.1 answer that ends its connection, for what is refused before there is a request."""
+    phrase = HTTPStatus(status).phrase
+    request_id = uuid.uuid4().hex
+    answer = respond(request_id, status, phrase, code, detail, setting=setting)
+    answer.headers["X-Request-Id"] = request_id
+    answer.headers["Connection"] = "close"
+    if status == 503:
+        answer.headers["Retry-After"] = str(_RETRY_AFTER_S)
+    head = [f"HTTP/1.1 {status} {phrase}".encode(), *(name + b": " + value for name, value in answer.raw_headers)]
+    return b"\r\n".join([*head, b"", bytes(answer.body)])
 
 
 def responses(*kinds: type[errors.UnbendError]) -> dict[int | str, dict[str, Any]]:

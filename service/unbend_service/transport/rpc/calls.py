@@ -1,11 +1,11 @@
-"""Around every call: admission, errors, metrics, request ids."""
+"""Around every call: parsing, admission, errors, metrics, request ids."""
 
 from __future__ import annotations
 
 import asyncio
 import secrets
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any
 
 import grpc
@@ -13,6 +13,7 @@ import structlog
 
 from unbend_service.application.service import Service
 from unbend_service.domain.errors import UnbendError
+from unbend_service.transport.rpc.messages import parse, parse_all
 from unbend_service.transport.rpc.status import INTERNAL, Status, status_of
 
 log = structlog.get_logger(__name__)
@@ -24,10 +25,11 @@ Context = grpc.aio.ServicerContext[Any, Any]
 
 
 class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg] # generic in its stubs only
-    """Wraps the methods of unbend.v1; health and reflection are left as they are.
+    """Wraps every method: its messages are parsed here; what else is said holds for the methods of unbend.v1.
 
     Servicers raise errors of the application; here they become statuses. A request id is taken from the metadata
-    (``x-request-id``) or made, bound to the log lines of the call, and sent back in the trailing metadata.
+    (``x-request-id``) or made, bound to the log lines of the call, and sent back in the trailing metadata. The message
+    of a unary call counts among the request bodies in memory for as long as the call lasts.
     """
 
     def __init__(self, service: Service) -> None:
@@ -39,28 +41,33 @@ class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg] # g
         handler_call_details: grpc.HandlerCallDetails,
     ) -> grpc.RpcMethodHandler[Any, Any]:
         handler = await continuation(handler_call_details)
-        method = handler_call_details.method
-        if handler is None or not method.startswith(_OURS):
+        if handler is None:
             return handler
+        method = handler_call_details.method
+        if not method.startswith(_OURS):
+            return _parsing(method, handler)
         name = method.removeprefix(_OURS)
         request_id = _request_id(handler_call_details)
+        parser: Any = handler.request_deserializer
         if handler.unary_unary is not None:
             unary: Any = handler.unary_unary  # asynchronous, which the stubs do not know
 
-            async def answer(request: Any, context: Any) -> Any:
-                return await self._watched(name, request_id, context, unary(request, context))
+            async def call(raw: bytes, context: Any) -> Any:
+                with self._service.bodies.holding() as holding:
+                    holding.grow(len(raw))
+                    return await unary(parse(method, parser, raw), context)
 
-            return grpc.unary_unary_rpc_method_handler(
-                answer, handler.request_deserializer, handler.response_serializer
-            )
+            async def answer(raw: bytes, context: Any) -> Any:
+                return await self._watched(name, request_id, context, call(raw, context))
+
+            return grpc.unary_unary_rpc_method_handler(answer, None, handler.response_serializer)
         stream: Any = handler.stream_stream
 
-        async def converse(requests: Any, context: Any) -> None:
+        async def converse(raws: Any, context: Any) -> None:
+            requests = parse_all(method, parser, raws)
             await self._watched(name, request_id, context, stream(requests, context))
 
-        return grpc.stream_stream_rpc_method_handler(
-            converse, handler.request_deserializer, handler.response_serializer
-        )
+        return grpc.stream_stream_rpc_method_handler(converse, None, handler.response_serializer)
 
     async def _watched(self, name: str, request_id: str, context: Context, work: Awaitable[Any]) -> Any:
         start = time.perf_counter()
@@ -100,6 +107,38 @@ class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg] # g
         finally:
             if not admitted and asyncio.iscoroutine(work):
                 work.close()
+
+
+def _parsing(method: str, handler: grpc.RpcMethodHandler[Any, Any]) -> grpc.RpcMethodHandler[Any, Any]:
+    """The same handler, to which a broken message is the caller's error; of health and reflection."""
+    parser: Any = handler.request_deserializer
+    behaviour: Any = handler.unary_unary or handler.unary_stream or handler.stream_stream
+
+    async def parsed(raw: bytes, context: Context) -> Any:
+        try:
+            return parse(method, parser, raw)
+        except UnbendError as error:
+            status = status_of(error)
+            return await context.abort(status.code, status.message, status.trailing_metadata)
+
+    async def parsed_all(raws: AsyncIterator[bytes], context: Context) -> AsyncIterator[Any]:
+        async for raw in raws:
+            yield await parsed(raw, context)
+
+    if handler.request_streaming:
+
+        async def converse(raws: Any, context: Any) -> AsyncIterator[Any]:
+            async for response in behaviour(parsed_all(raws, context), context):
+                yield response
+
+        return grpc.stream_stream_rpc_method_handler(converse, None, handler.response_serializer)
+
+    async def answer(raw: bytes, context: Any) -> Any:
+        return await behaviour(await parsed(raw, context), context)
+
+    if handler.response_streaming:
+        return grpc.unary_stream_rpc_method_handler(answer, None, handler.response_serializer)
+    return grpc.unary_unary_rpc_method_handler(answer, None, handler.response_serializer)
 
 
 def _request_id(details: grpc.HandlerCallDetails) -> str:

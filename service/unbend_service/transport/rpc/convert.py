@@ -53,6 +53,8 @@ FRAME_STATUSES: dict[FrameStatus, correction_pb2.FrameStatus.ValueType] = {
     FrameStatus.DROPPED: correction_pb2.FRAME_STATUS_DROPPED,
     FrameStatus.FAILED: correction_pb2.FRAME_STATUS_FAILED,
 }
+#: Far more than the domain takes; so many are not even looked at.
+_MOST_GUIDES = 256
 _FORMAT_NAMES = ", ".join([*RAW_FORMATS.values(), *ENCODED_FORMATS.values()])
 
 
@@ -127,6 +129,8 @@ def to_grid(message: grid_pb2.Grid) -> Grid:
 
 def to_guides(message: grid_pb2.Guides) -> Guides:
     """Raises InvalidGuides."""
+    if max(len(message.rows), len(message.columns)) > _MOST_GUIDES:
+        raise InvalidGuides(f"{len(message.rows)} and {len(message.columns)} guides.", allowed="2 to 16 a direction")
     return Guides(_to_family(list(message.rows)), _to_family(list(message.columns)))
 
 

@@ -41,13 +41,20 @@ def server_options(settings: Settings) -> list[tuple[str, int]]:
         ("grpc.keepalive_permit_without_calls", 1),
         ("grpc.http2.min_ping_interval_without_data_ms", 10_000),  # clients may ping as often as ours does
         ("grpc.http2.max_ping_strikes", 3),
+        ("grpc.max_metadata_size", settings.grpc_metadata_bytes),
+        ("grpc.absolute_max_metadata_size", 2 * settings.grpc_metadata_bytes),  # between the two refusal is by chance
+        ("grpc.max_concurrent_streams", settings.grpc_calls),  # of one connection
         ("grpc.so_reuseport", 0),  # a second server on the port is a mistake, not a load balancer
     ]
 
 
 def create_server(service: Service, settings: Settings) -> grpc.aio.Server:
     """A server with all services, not yet listening. Must be called in a running event loop."""
-    server = grpc.aio.server(interceptors=(CallInterceptor(service),), options=server_options(settings))
+    server = grpc.aio.server(
+        interceptors=(CallInterceptor(service),),
+        options=server_options(settings),
+        maximum_concurrent_rpcs=settings.grpc_calls,  # of all connections
+    )
     estimation_pb2_grpc.add_EstimationServiceServicer_to_server(
         EstimationServicer(service.estimation, settings), server
     )

@@ -21,6 +21,7 @@ STATUS_CODES: dict[type[errors.UnbendError], grpc.StatusCode] = {
     errors.EmptyBody: grpc.StatusCode.INVALID_ARGUMENT,
     errors.InvalidImage: grpc.StatusCode.INVALID_ARGUMENT,
     errors.TooManyPixels: grpc.StatusCode.INVALID_ARGUMENT,
+    errors.ImageTooCostly: grpc.StatusCode.INVALID_ARGUMENT,
     errors.UnsupportedMediaType: grpc.StatusCode.INVALID_ARGUMENT,
     errors.BodyTooLarge: grpc.StatusCode.INVALID_ARGUMENT,
     errors.InvalidOption: grpc.StatusCode.INVALID_ARGUMENT,
@@ -34,6 +35,7 @@ STATUS_CODES: dict[type[errors.UnbendError], grpc.StatusCode] = {
     errors.GridConflict: grpc.StatusCode.FAILED_PRECONDITION,
     errors.Overloaded: grpc.StatusCode.RESOURCE_EXHAUSTED,
     errors.QueueFull: grpc.StatusCode.RESOURCE_EXHAUSTED,
+    errors.MemoryFull: grpc.StatusCode.RESOURCE_EXHAUSTED,
     errors.TooManyStreams: grpc.StatusCode.RESOURCE_EXHAUSTED,
     errors.Unavailable: grpc.StatusCode.UNAVAILABLE,
     errors.Draining: grpc.StatusCode.UNAVAILABLE,
@@ -45,6 +47,7 @@ STATUS_CODES: dict[type[errors.UnbendError], grpc.StatusCode] = {
     errors.StreamEnded: grpc.StatusCode.ABORTED,
     errors.StreamTakenOver: grpc.StatusCode.ABORTED,
     errors.StreamIdle: grpc.StatusCode.ABORTED,
+    errors.RequestStalled: grpc.StatusCode.DEADLINE_EXCEEDED,
     errors.DeadlineExceeded: grpc.StatusCode.DEADLINE_EXCEEDED,
 }
 
