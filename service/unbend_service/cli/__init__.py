@@ -8,6 +8,7 @@ from unbend_service.cli.annotate import annotate
 from unbend_service.cli.correct import correct
 from unbend_service.cli.doctor import doctor
 from unbend_service.cli.estimate import estimate
+from unbend_service.cli.eval import evaluate
 from unbend_service.cli.grid import grid
 from unbend_service.cli.serve import serve
 from unbend_service.cli.show import show
@@ -22,6 +23,7 @@ app = typer.Typer(
 )
 for verb in (serve, correct, video, show, estimate, annotate, doctor):
     app.command()(verb)
+app.command("eval")(evaluate)
 app.add_typer(grid)
 
 

@@ -1,0 +1,111 @@
+"""What is measured: models as the service runs them, and peers."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from unbend_service.application.ports import Estimator
+from unbend_service.domain.decision import decide
+from unbend_service.domain.grid import Grid
+from unbend_service.domain.guides import Guides
+from unbend_service.domain.records import Correct, Outcome
+from unbend_service.evaluation.cases import Bytes, Case
+
+GRID_POINTS = 65
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What a method makes of one picture.
+
+    Attributes:
+        guides: None where it has none.
+        lens, everything: the grids of `correct=nonlinear` and `correct=all`, before any threshold.
+        confidence: 0..1.
+        applies: whether the service, at the threshold that the model's card advises, would correct the lens.
+        expected_error_px: of the lens, px at 256 wide; None where the method has no say.
+        seconds: that the look took.
+    """
+
+    guides: Guides | None
+    lens: Grid
+    everything: Grid
+    confidence: float
+    applies: bool
+    expected_error_px: float | None
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Method:
+    """Something that looks at pictures.
+
+    Attributes:
+        name: in tables.
+        look: what it makes of a case; peers that know the truth are told it, models see the picture alone.
+        min_confidence: that its card advises.
+    """
+
+    name: str
+    look: Callable[[Case], Look]
+    min_confidence: float
+
+
+def model_method(estimator: Estimator, name: str | None = None) -> Method:
+    """An estimator, decided on as in the service."""
+    threshold = estimator.model.min_confidence
+
+    def look(case: Case) -> Look:
+        started = time.perf_counter()
+        estimate = estimator.estimate(case.picture)
+        seconds = time.perf_counter() - started
+        return _decided(
+            estimate.guides,
+            estimate.confidence,
+            threshold,
+            None if estimate.expected_error is None else estimate.expected_error * 128,
+            seconds,
+        )
+
+    return Method(name or estimator.model.name, look, threshold)
+
+
+def guides_method(name: str, examine: Callable[[Bytes], Guides]) -> Method:
+    """A peer that answers with guides and never says no."""
+
+    def look(case: Case) -> Look:
+        started = time.perf_counter()
+        guides = examine(case.picture)
+        return _decided(guides, 1.0, 0.0, None, time.perf_counter() - started)
+
+    return Method(name, look, 0.0)
+
+
+def doing_nothing() -> Method:
+    identity = Grid.identity(GRID_POINTS, GRID_POINTS)
+    return Method("doing nothing", lambda case: Look(None, identity, identity, 1.0, False, 0.0, 0.0), 0.0)
+
+
+def knowing_the_truth() -> Method:
+    """The true map on the service's lattice: what a perfect estimate would reach."""
+
+    def look(case: Case) -> Look:
+        grid = Grid.from_map(lambda target: np.nan_to_num(case.truth(target), nan=8.0).clip(-8, 8), 65, 65)
+        return Look(None, grid, grid, 1.0, True, 0.0, 0.0)
+
+    return Method("the true map", look, 0.0)
+
+
+def _decided(
+    guides: Guides, confidence: float, threshold: float, expected_error_px: float | None, seconds: float
+) -> Look:
+    lens, everything = (
+        decide(guides, confidence, "", "", correct=correct, min_confidence=0.0, points=GRID_POINTS)
+        for correct in (Correct.NONLINEAR, Correct.ALL)
+    )
+    applies = confidence >= threshold and lens.outcome is Outcome.CORRECTED
+    return Look(guides, lens.grid, everything.grid, confidence, applies, expected_error_px, seconds)

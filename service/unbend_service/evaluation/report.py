@@ -1,0 +1,117 @@
+"""What an evaluation leaves behind: a page of tables, and every measurement as JSON."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unbend_service.evaluation import suites, tables
+from unbend_service.evaluation.lenses import is_straight
+from unbend_service.evaluation.suites import Measurement
+
+REPORT, RESULTS = "report.md", "results.json"
+_TITLES = {
+    suites.SYNTHETIC: "Six families, none and mixed",
+    suites.NO_HARM: "Undistorted photographs",
+    suites.REAL_LENSES: "Real lenses",
+    suites.OBLIQUE: "Oblique and upright views",
+}
+
+
+@dataclass
+class Evaluation:
+    """Suite -> method -> measurements, and what was shown to whom.
+
+    Attributes:
+        photographs: how many, and of which folder.
+        models: name -> SHA-256 of the weights.
+    """
+
+    photographs: str
+    models: dict[str, str]
+    measured: dict[str, dict[str, list[Measurement]]] = field(default_factory=dict)
+    sections: list[str] = field(default_factory=list)
+
+    def markdown(self) -> str:
+        """The whole page."""
+        parts = [
+            "# Evaluation\n",
+            f"{self.photographs}. End-point errors of the backward map in pixels of a picture whose long side is 256:"
+            " of everything (`all`, `correct=all`), and up to the best homography (`lens`, `correct=nonlinear`)."
+            " *Applied* is what the service does at the confidence that the model's card advises.\n",
+        ]
+        for suite, by_method in self.measured.items():
+            parts.append(f"## {_TITLES[suite]}\n")
+            for method, measurements in by_method.items():
+                parts.append(f"### {method}\n\n{self._table(suite, method, measurements)}")
+        parts += self.sections
+        if self.models:
+            parts.append("## Weights\n\n| model | SHA-256 |\n|---|---|")
+            parts[-1] += "".join(f"\n| {name} | `{digest}` |" for name, digest in self.models.items()) + "\n"
+        return "\n".join(parts)
+
+    def _table(self, suite: str, method: str, measurements: list[Measurement]) -> str:
+        if suite == suites.REAL_LENSES:
+            return tables.lens_table(measurements)
+        if suite == suites.OBLIQUE:
+            return tables.oblique_table(measurements)
+        if suite == suites.NO_HARM:
+            bent = self.measured.get(suites.SYNTHETIC, {}).get(method, [])
+            return tables.no_harm_table(measurements, bent)
+        return tables.family_table(measurements)
+
+    def summary(self) -> dict[str, Any]:
+        """Method -> the handful of figures that a target can be set for."""
+        found: dict[str, dict[str, float]] = {}
+        for suite, by_method in self.measured.items():
+            for method, measurements in by_method.items():
+                found.setdefault(method, {}).update(_figures(suite, measurements))
+        return found
+
+    def write(self, folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / REPORT).write_text(self.markdown(), encoding="utf-8")
+        results = {
+            "photographs": self.photographs,
+            "models": self.models,
+            "summary": self.summary(),
+            "measurements": {
+                suite: {method: [asdict(m) for m in own] for method, own in by_method.items()}
+                for suite, by_method in self.measured.items()
+            },
+        }
+        (folder / RESULTS).write_text(json.dumps(results, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _figures(suite: str, measurements: list[Measurement]) -> dict[str, float]:
+    if suite == suites.REAL_LENSES:
+        rows = tables.lens_rows(measurements)
+        straight = [row for row in rows if is_straight(row.camera)]
+        figures = {
+            "real_lenses_removed": tables.removed_share(rows, applied=False),
+            "real_lenses_removed_as_applied": tables.removed_share(rows),
+            "real_lenses_harmed": float(np.mean([row.harmed for row in rows])),
+        }
+        if straight:
+            figures["straight_cameras_px"] = float(np.mean([row.applied_px for row in straight]))
+        return figures
+    if suite == suites.OBLIQUE:
+        return {
+            "oblique_ratio": tables.oblique_ratio(measurements),
+            "oblique_ratio_as_applied": tables.oblique_ratio(measurements, applied=True),
+        }
+    if suite == suites.NO_HARM:
+        moved, _, _, _ = tables.harm_at(measurements, [], None)
+        return {
+            "undistorted_unmoved": float((moved < tables.MOVED_PX).mean()),
+            "undistorted_p95_px": float(np.percentile(moved, 95)),
+        }
+    figures = {}
+    for family, own in tables.groups(measurements).items():
+        figures[f"all_{family}_px"] = float(np.mean([m.error_px for m in own]))
+        figures[f"lens_{family}_px"] = float(np.mean([m.lens_px for m in own]))
+    return figures

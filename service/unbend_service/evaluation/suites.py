@@ -1,0 +1,172 @@
+"""The suites: which pictures are shown to a method, and what is noted of each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from unbend_service.domain.maps import target_lattice
+from unbend_service.evaluation.cases import Bytes, Case, Float64, Photograph, grey_of, reduced
+from unbend_service.evaluation.chessboards import chessboard_cases, has_chessboards
+from unbend_service.evaluation.families import FAMILIES, family_cases
+from unbend_service.evaluation.lenses import lens_cases
+from unbend_service.evaluation.measures import as_rendered, displacement_px, map_errors, ssim_and_mse
+from unbend_service.evaluation.methods import Look, Method
+from unbend_service.evaluation.oblique import oblique_cases
+
+SYNTHETIC, NO_HARM, REAL_LENSES, OBLIQUE = "synthetic", "no-harm", "real-lenses", "oblique"
+SUITES = (SYNTHETIC, NO_HARM, REAL_LENSES, OBLIQUE)
+_WHOLE_LONG_SIDE_PX = 512
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One picture and one method; px are those of a picture whose long side is 256.
+
+    Attributes:
+        group: family or camera.
+        picture: number of the picture in its suite, the same for every method.
+        nothing_px, error_px: EPE of everything, of doing nothing and of `correct=all`.
+        lens_nothing_px, lens_px: the same up to a homography, of doing nothing and of `correct=nonlinear`.
+        moved_px: mean displacement by `correct=nonlinear`.
+        confidence, applies, expected_error_px, seconds: see :class:`~.methods.Look`.
+        ssim_nothing, ssim, mse_nothing, mse: of the picture corrected with `all`; None where there is no original.
+    """
+
+    group: str
+    picture: int
+    nothing_px: float
+    error_px: float
+    lens_nothing_px: float
+    lens_px: float
+    moved_px: float
+    confidence: float
+    applies: bool
+    expected_error_px: float | None
+    seconds: float
+    ssim_nothing: float | None = None
+    ssim: float | None = None
+    mse_nothing: float | None = None
+    mse: float | None = None
+
+    @property
+    def applied_px(self) -> float:
+        """Error of the lens as the service leaves it: corrected above the threshold, else as it was."""
+        return self.lens_px if self.applies else self.lens_nothing_px
+
+
+#: Called with a case, its number and the look at it: figures are made of them.
+Witness = Callable[[Case, Look, Measurement], None]
+
+
+def run_suite(
+    name: str,
+    methods: list[Method],
+    photographs: list[Photograph],
+    *,
+    families: Iterable[str] = FAMILIES,
+    per_camera: int = 5,
+    chessboards: Path | None = None,
+    scenes: list[Photograph] | None = None,
+    quality: bool = True,
+    witness: Witness | None = None,
+) -> dict[str, list[Measurement]]:
+    """Method name -> its measurements; every method sees the same pictures, each of which is made once.
+
+    Args:
+        name: one of SUITES.
+        per_camera: photographs a camera of the real lenses.
+        chessboards: folder of left01.jpg, right01.jpg and so on, for the real lenses.
+        scenes: more straight pictures for the oblique suite.
+        quality: whether SSIM and MSE are measured where there is an original.
+    """
+    cases: Iterator[Case]
+    if name == SYNTHETIC:
+        cases = (case for family in families for case in family_cases(family, photographs))
+    elif name == NO_HARM:
+        cases = (_whole(photograph) for photograph in photographs)
+    elif name == REAL_LENSES:
+        cases = _real_lenses(photographs, per_camera, chessboards)
+    elif name == OBLIQUE:
+        cases = oblique_cases(photographs + (scenes or []))
+    else:
+        raise ValueError(f"There is no suite {name!r}.")
+    measured: dict[str, list[Measurement]] = {method.name: [] for method in methods}
+    for number, case in enumerate(cases):
+        for method in methods:
+            look = method.look(case)
+            measurement = measure(case, look, number, quality=quality and name == SYNTHETIC)
+            measured[method.name].append(measurement)
+            if witness is not None and method is methods[0]:
+                witness(case, look, measurement)
+    return measured
+
+
+def measure(case: Case, look: Look, number: int = 0, *, quality: bool = True) -> Measurement:
+    """What one look at one case is worth."""
+    target, truth = case.correspondences()
+    half_px = case.half_px
+    lens, everything = as_rendered(look.lens), as_rendered(look.everything)
+    nothing_px, lens_nothing_px = map_errors(lambda points: points, target, truth, half_px)
+    error_px = float(np.hypot(*((everything(target) - truth) * half_px).T).mean())
+    _, lens_px = map_errors(lens, target, truth, half_px)
+    ssim_nothing = ssim = mse_nothing = mse = None
+    if quality and case.original is not None:
+        shown = _shown(case)
+        ssim_nothing, mse_nothing = ssim_and_mse(case.picture, case.original, shown)
+        ssim, mse = ssim_and_mse(rendered(case.picture, look), case.original, shown)
+    return Measurement(
+        group=case.group,
+        picture=number,
+        nothing_px=nothing_px,
+        error_px=error_px,
+        lens_nothing_px=lens_nothing_px,
+        lens_px=lens_px,
+        moved_px=displacement_px(lens, target_lattice(33, 33).reshape(-1, 2), half_px),
+        confidence=look.confidence,
+        applies=look.applies,
+        expected_error_px=look.expected_error_px,
+        seconds=look.seconds,
+        ssim_nothing=ssim_nothing,
+        ssim=ssim,
+        mse_nothing=mse_nothing,
+        mse=mse,
+    )
+
+
+def rendered(picture: Bytes, look: Look) -> Bytes:
+    """The picture corrected with `correct=all`, the border continued."""
+    import cv2
+
+    from unbend_service.domain.dense_maps import pixel_maps
+
+    height, width = picture.shape
+    map_x, map_y = pixel_maps(look.everything, width, height)
+    corrected = cv2.remap(picture, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(corrected, np.uint8)
+
+
+def _shown(case: Case) -> np.typing.NDArray[np.bool_]:
+    height, width = case.picture.shape
+    x, y = (np.arange(size) * 2 / size + 1 / size - 1 for size in (width, height))
+    source = case.truth(np.stack(np.meshgrid(x, y), -1))
+    limit = 1 - 1 / np.array([width, height])
+    with np.errstate(invalid="ignore"):
+        return np.asarray((np.abs(source) <= limit).all(-1))
+
+
+def _whole(photograph: Photograph) -> Case:
+    return Case("undistorted", grey_of(reduced(photograph.pixels, _WHOLE_LONG_SIDE_PX)), _identity)
+
+
+def _identity(target: Float64) -> Float64:
+    return target
+
+
+def _real_lenses(photographs: list[Photograph], per_camera: int, chessboards: Path | None) -> Iterator[Case]:
+    yield from lens_cases(photographs, per_camera)
+    if chessboards is not None and has_chessboards(chessboards):
+        yield from chessboard_cases(chessboards)
