@@ -7,9 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unbend_service.domain.aggregation import aggregate_guides, weighted_median
+from unbend_service.domain.aggregation import Look, fuse, weighted_median
 from unbend_service.domain.errors import InvalidGuides
-from unbend_service.domain.guides import GuideFamily, Guides
+from unbend_service.domain.fitting import guides_from_map
+from unbend_service.domain.guides import Float64, GuideFamily, Guides
+from unbend_service.domain.homography import apply_homography, without_plane_part
 from unbend_service.domain.maps import target_lattice
 
 ANCHORS = np.array([-0.9, -0.3, 0.3, 0.9])
@@ -23,55 +25,107 @@ def bent(bend: float) -> Guides:
     return Guides(family, family)
 
 
-def bend_of(guides: Guides) -> float:
-    return float(-guides.rows.coefficients[0, 2] / guides.rows.anchors[0])
+def lens_of(guides: Guides) -> Float64:
+    """The map without its plane part."""
+    return without_plane_part(guides)(target_lattice(17, 17, 0.9))
 
 
-def test_frames_that_are_far_off_do_not_move_the_grid() -> None:
+def distance(one: Float64, other: Float64) -> float:
+    return float(np.hypot(*(one - other).reshape(-1, 2).T).mean())
+
+
+def looks(guides: list[Guides], error: float = 0.005, confidence: float = 0.9) -> list[Look]:
+    return [Look(one, confidence, error) for one in guides]
+
+
+def apart(one: Guides, other: Guides) -> float:
+    target = target_lattice(17, 17, 0.9)
+    return float(np.abs(one(target) - other(target)).max())
+
+
+def test_looks_that_are_far_off_do_not_move_the_grid() -> None:
     good = [bent(0.06), bent(0.062), bent(0.058), bent(0.061), bent(0.059)]
-    wild = np.random.default_rng(1).uniform(-0.3, 0.3, (4, 6))
-    outlier = Guides(GuideFamily(ANCHORS, wild), GuideFamily(ANCHORS, -wild))
 
-    guides, _ = aggregate_guides([good[0], outlier, *good[1:], outlier], [0.9] * 7)
+    fused = fuse(looks([good[0], bent(-0.3), *good[1:], bent(0.35)]))
 
-    difference = guides(target_lattice(17, 17)) - bent(0.06)(target_lattice(17, 17))
-    assert np.abs(difference).max() < 0.005
+    assert fused.agreeing == 5
+    assert apart(fused.guides, bent(0.06)) < 0.002
 
 
-def test_a_frame_counts_as_much_as_its_confidence() -> None:
-    guides, confidence = aggregate_guides([bent(0.02), bent(0.02), bent(0.1)], [0.1, 0.1, 0.9])
+def test_a_look_counts_by_the_error_it_expects() -> None:
+    sure, unsure = Look(bent(0.10), 0.9, 0.002), Look(bent(0.08), 0.9, 0.02)
 
-    assert bend_of(guides) == pytest.approx(0.1)
-    assert confidence == pytest.approx(0.1)
+    fused = fuse([unsure, sure])
 
-
-def test_without_any_confidence_the_frames_count_the_same() -> None:
-    guides, confidence = aggregate_guides([bent(0.02), bent(0.04), bent(0.3)], [0.0, 0.0, 0.0])
-
-    assert bend_of(guides) == pytest.approx(0.04)
-    assert confidence == 0
+    assert apart(fused.guides, bent(0.10)) < 0.001
+    assert fused.expected_error < 0.003
 
 
-def test_one_frame_comes_back_as_it_is() -> None:
+def test_noise_averages_out() -> None:
+    """Ten looks with independent errors are at least twice as near to the lens as one."""
+    rng = np.random.default_rng(3)
+    true = bent(0.08)
+
+    def noisy() -> Guides:
+        families = [
+            GuideFamily(ANCHORS, family.coefficients + rng.normal(0, 0.01, (4, 6)) * (np.arange(6) > 1))
+            for family in (true.rows, true.columns)
+        ]
+        return Guides(*families)
+
+    seen = [noisy() for _ in range(10)]
+    truth = lens_of(true)
+
+    single = np.mean([distance(lens_of(one), truth) for one in seen])
+    together = distance(lens_of(fuse(looks(seen)).guides), truth)
+
+    assert together < single / 2
+
+
+def test_pictures_taken_askew_still_agree_on_the_lens() -> None:
+    """Each is seen with another tilt; what they have in common is found whatever the pose."""
+    true = bent(0.08)
+    rng = np.random.default_rng(5)
+    seen = []
+    for _ in range(5):
+        tilt = np.eye(3) + rng.normal(0, 0.04, (3, 3)) * [[1, 1, 0], [1, 1, 0], [1, 1, 0]]
+        seen.append(guides_from_map(lambda points, tilt=tilt: true(apply_homography(tilt, points)), ANCHORS))
+
+    fused = fuse(looks(seen))
+
+    assert fused.agreeing == 5
+    assert distance(lens_of(fused.guides), lens_of(true)) < 0.004
+
+
+def test_guides_of_different_number_and_degree_are_combined() -> None:
+    finer = guides_from_map(bent(0.06), np.linspace(-0.9, 0.9, 8))
+
+    fused = fuse(looks([bent(0.06), finer]))
+
+    assert len(fused.guides.rows.anchors) == 8
+    assert apart(fused.guides, bent(0.06)) < 0.001
+
+
+def test_one_look_comes_back_as_it_is() -> None:
     only = bent(0.05)
 
-    guides, confidence = aggregate_guides([only], [0.4])
+    fused = fuse([Look(only, 0.4, 0.01)])
 
-    assert np.array_equal(guides.rows.coefficients, only.rows.coefficients)
-    assert confidence == 0.4
-
-
-def test_two_frames_of_equal_confidence_meet_in_the_middle() -> None:
-    guides, _ = aggregate_guides([bent(0.02), bent(0.06)], [0.5, 0.5])
-
-    assert bend_of(guides) == pytest.approx(0.04)
+    assert fused.guides is only
+    assert (fused.confidence, fused.expected_error) == (0.4, 0.01)
 
 
-def test_guides_that_do_not_belong_together_are_refused() -> None:
-    with pytest.raises(InvalidGuides, match="different"):
-        aggregate_guides([Guides.straight(), Guides.straight(degree=3)], [1, 1])
+def test_agreement_adds_confidence_and_a_blind_frame_takes_none() -> None:
+    sure = looks([bent(0.06)] * 4, confidence=0.8)
+    blind = Look(Guides.straight(), 0.0, None)
+
+    assert fuse(sure).confidence > 0.85
+    assert fuse([*sure, blind]).confidence > 0.8
+
+
+def test_without_any_guides_there_is_nothing_to_combine() -> None:
     with pytest.raises(InvalidGuides, match="no guides"):
-        aggregate_guides([], [])
+        fuse([])
 
 
 @given(

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 from unbend_service.application.blocking import BlockingWork
 from unbend_service.application.fitting import FittedGrids
 from unbend_service.application.grey import grey_of_frame
 from unbend_service.application.known import HASHED_AT_ONCE_BYTES, Known, digest
 from unbend_service.application.ports import Bytes, Estimate, Estimator, GridStore, ImageCodec, Meter
+from unbend_service.domain.aggregation import Look, fuse
 from unbend_service.domain.decision import decide
 from unbend_service.domain.errors import InvalidOption
 from unbend_service.domain.fit import KEEP, Fit
@@ -24,6 +26,18 @@ def check_confidence(min_confidence: float) -> float:
     if not 0 <= min_confidence <= 1:
         raise InvalidOption(f"min_confidence={min_confidence!r} is out of range.", allowed="0..1")
     return min_confidence
+
+
+def fused_estimate(estimates: Sequence[Estimate]) -> Estimate:
+    """What several estimates of one camera's pictures say together; blocking.
+
+    Raises:
+        InvalidGuides: no estimate, or none with guides that intersect.
+    """
+    fused = fuse([Look(one.guides, one.confidence, one.expected_error) for one in estimates])
+    return dataclasses.replace(
+        estimates[0], guides=fused.guides, confidence=fused.confidence, expected_error=fused.expected_error
+    )
 
 
 class Estimation:

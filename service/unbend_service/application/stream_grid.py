@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from unbend_service.application.blocking import BlockingWork
 from unbend_service.application.correction import Correction, leaves_alone
-from unbend_service.application.estimation import ESTIMATE_LONGEST_PX, Estimation
+from unbend_service.application.estimation import ESTIMATE_LONGEST_PX, Estimation, fused_estimate
 from unbend_service.application.grey import grey_of_frame
 from unbend_service.application.ports import Bytes, Estimate, GridStore
 from unbend_service.application.stream_messages import DrawnGuides, EstimateOver, StoredGrid, StreamConfig
 from unbend_service.application.turns import Turns
-from unbend_service.domain.aggregation import aggregate_guides
 from unbend_service.domain.decision import spin_grid
 from unbend_service.domain.errors import GridNotFound
 from unbend_service.domain.frames import Frame
@@ -179,11 +178,8 @@ class StreamGrid:
         self._estimates.append(await self._turns.run(lambda: self._estimation.of_grey(grey)))
 
     async def _decide(self) -> None:
-        guides, confidence = aggregate_guides(
-            [estimate.guides for estimate in self._estimates], [estimate.confidence for estimate in self._estimates]
-        )
         options = self._config.options
-        combined = replace(self._estimates[0], guides=guides, confidence=confidence)
+        combined = await self._blocking.run("grid", fused_estimate, self._estimates)
         record = await self._estimation.record(combined, options.correct, options.min_confidence)
         await self._store.bind_stream(self._stream_id, record.id)
         fixed = await self._fit(record)

@@ -13,9 +13,8 @@ from typing import Protocol
 import numpy as np
 
 from unbend_service.application.blocking import BlockingWork
-from unbend_service.application.estimation import ESTIMATE_LONGEST_PX, Estimation
+from unbend_service.application.estimation import ESTIMATE_LONGEST_PX, Estimation, fused_estimate
 from unbend_service.application.grey import grey_of_frame
-from unbend_service.domain.aggregation import aggregate_guides
 from unbend_service.domain.errors import InvalidFrame
 from unbend_service.domain.frames import Bytes, Frame, PixelFormat, frame_size_bytes
 from unbend_service.domain.records import Correct, GridRecord
@@ -162,8 +161,8 @@ async def estimate_over(
     for frame in frames:
         grey = await blocking.run("decode", grey_of_frame, frame, ESTIMATE_LONGEST_PX)
         estimates.append(await estimation.of_grey(grey))
-    guides, confidence = aggregate_guides([one.guides for one in estimates], [one.confidence for one in estimates])
-    return await estimation.record(replace(estimates[0], guides=guides, confidence=confidence), correct, min_confidence)
+    combined = await blocking.run("grid", fused_estimate, estimates)
+    return await estimation.record(combined, correct, min_confidence)
 
 
 def side_by_side(left: Frame, right: Frame) -> Frame:
