@@ -15,6 +15,7 @@ from unbend_service.application.exchange import Exchange
 from unbend_service.application.fitting import FittedGrids
 from unbend_service.application.grids import GridLibrary
 from unbend_service.application.illustration import Illustration
+from unbend_service.application.regions import Regions
 from unbend_service.application.service import Service
 from unbend_service.application.streams import Streams
 from unbend_service.settings import Settings
@@ -39,7 +40,8 @@ def service_over_fakes(settings: Settings, store: MemoryGridStore | None = None)
     correction = Correction(
         estimation, codec, store, grids, pool, blocking, meter, jpeg_quality=92, deadline_s=settings.render_deadline_s
     )
-    streams = Streams(estimation, correction, store, codec, blocking, meter, settings)
+    regions = Regions(pool, settings.local_memory_bytes)
+    streams = Streams(estimation, correction, store, codec, blocking, meter, regions, settings)
     library = GridLibrary(store, blocking, grid_points=settings.grid_points)
     return Service(
         estimation=estimation,
@@ -48,6 +50,7 @@ def service_over_fakes(settings: Settings, store: MemoryGridStore | None = None)
         grids=library,
         exchange=Exchange(ExchangeFiles(), grids, blocking),
         streams=streams,
+        regions=regions,
         pool=pool,
         store=store,
         codec=codec,

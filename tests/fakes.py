@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 
-from unbend_service.application.ports import Bytes, Estimate, ModelInfo, PoolState, RendererInfo, WorkerState
+from unbend_service.adapters.renderers.regions import RegionKeeper
+from unbend_service.application.ports import (
+    Bytes,
+    Estimate,
+    ModelInfo,
+    PoolState,
+    RendererInfo,
+    SharedMemory,
+    SharedPicture,
+    WorkerState,
+)
 from unbend_service.domain.errors import Draining, UnbendError
 from unbend_service.domain.frames import Border, Frame, split_planes
 from unbend_service.domain.grid import Grid
@@ -73,19 +84,37 @@ class FakeRenderPool:
     ready: bool = True
     rendered: int = 0
     closed: bool = False
+    regions: RegionKeeper = field(default_factory=lambda: RegionKeeper(itertools.count().__next__, lambda _: None))
 
     async def start(self) -> None:
         self.ready = True
 
     async def render(
-        self, frame: Frame, grid: Grid, border: Border, *, affinity: str | None = None, deadline_s: float | None = None
+        self,
+        frame: Frame,
+        grid: Grid,
+        border: Border,
+        *,
+        affinity: str | None = None,
+        deadline_s: float | None = None,
+        shared: SharedPicture | None = None,
     ) -> Bytes:
         if self.closed:
             raise Draining("The service is shutting down.")
         if self.failure is not None:
             raise self.failure
         self.rendered += 1
-        return draw_through(frame, grid, border)
+        drawn = draw_through(frame, grid, border)
+        if shared is None:
+            return drawn
+        np.copyto(shared.target, drawn)
+        return shared.target
+
+    def adopt(self, fd: int, size_bytes: int) -> SharedMemory:
+        return self.regions.adopt(fd, size_bytes)
+
+    def disown(self, memory: SharedMemory) -> None:
+        self.regions.disown(memory)
 
     def state(self) -> PoolState:
         worker = WorkerState("fake-0", "ready" if self.ready else "starting")

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from unbend._errors import InvalidImage as InvalidImage
     from unbend._errors import InvalidInput as InvalidInput
     from unbend._errors import InvalidOption as InvalidOption
+    from unbend._errors import InvalidRegion as InvalidRegion
     from unbend._errors import MemoryFull as MemoryFull
     from unbend._errors import MissingPackage as MissingPackage
     from unbend._errors import ModelUnavailable as ModelUnavailable
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from unbend._errors import ProtocolViolation as ProtocolViolation
     from unbend._errors import QueueFull as QueueFull
     from unbend._errors import Refused as Refused
+    from unbend._errors import RegionNotFound as RegionNotFound
     from unbend._errors import RendererUnavailable as RendererUnavailable
     from unbend._errors import RenderFailed as RenderFailed
     from unbend._errors import RequestStalled as RequestStalled
@@ -50,6 +52,7 @@ if TYPE_CHECKING:
     from unbend._errors import StreamIdle as StreamIdle
     from unbend._errors import StreamTakenOver as StreamTakenOver
     from unbend._errors import TooManyPixels as TooManyPixels
+    from unbend._errors import TooManyRegions as TooManyRegions
     from unbend._errors import TooManyStreams as TooManyStreams
     from unbend._errors import Unavailable as Unavailable
     from unbend._errors import UnbendError as UnbendError
@@ -92,6 +95,7 @@ _HOMES = {
         "InvalidInput",
         "InvalidOption",
         "MemoryFull",
+        "InvalidRegion",
         "MissingPackage",
         "ModelUnavailable",
         "Overloaded",
@@ -99,6 +103,7 @@ _HOMES = {
         "ProtocolViolation",
         "QueueFull",
         "Refused",
+        "RegionNotFound",
         "RenderFailed",
         "RendererUnavailable",
         "RequestStalled",
@@ -107,6 +112,7 @@ _HOMES = {
         "StreamIdle",
         "StreamTakenOver",
         "TooManyPixels",
+        "TooManyRegions",
         "TooManyStreams",
         "Unavailable",
         "UnbendError",

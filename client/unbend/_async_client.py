@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from collections.abc import Sequence
 from types import TracebackType
 from typing import Any, TypeVar, Unpack
@@ -42,11 +43,13 @@ class AsyncClient:
         retries: int = 2,
         credentials: grpc.ChannelCredentials | None = None,
         metadata: Sequence[tuple[str, str]] = (),
+        shared_memory: str | os.PathLike[str] | None = None,
     ) -> None:
         self._channel = open_channel(target, credentials)
         self._timeout_s = timeout_s
         self._retries = retries
         self._metadata = tuple(metadata)
+        self._shared_memory = None if shared_memory is None else os.fspath(shared_memory)
         self._closed = False
         self.grids = AsyncGrids(self)
 
@@ -85,7 +88,9 @@ class AsyncClient:
         """A stream of frames, to be used in an ``async with`` block; see :meth:`unbend.Client.stream`."""
         self._check_open()
         layout = FrameLayout.of(pixel_format, width, height)
-        return AsyncStream(self._channel, self._metadata, layout, StreamOptions(**options), self._timeout_s)
+        return AsyncStream(
+            self._channel, self._metadata, layout, StreamOptions(**options), self._timeout_s, self._shared_memory
+        )
 
     async def _run(self, call: calls.Call[T]) -> T:
         self._check_open()

@@ -11,8 +11,9 @@ import grpc
 from unbend import _types as types
 from unbend._channel import Metadata
 from unbend._connection import Connection, Event
-from unbend._errors import Closed, DeadlineExceeded, ServerFault, UnbendError
+from unbend._errors import Closed, DeadlineExceeded, ServerFault, TooManyRegions, Unavailable, UnbendError
 from unbend._images import FrameLayout
+from unbend._memory import FrameMemory
 from unbend._stream_core import StreamCore, StreamOptions, split
 
 Item = types.Image | tuple[types.Image, int]
@@ -39,10 +40,13 @@ class AsyncStream:
         layout: FrameLayout,
         options: StreamOptions,
         timeout_s: float,
+        shared_memory: str | None = None,
     ) -> None:
         self._channel = channel
         self._metadata = metadata
         self._timeout_s = timeout_s
+        self._shared_memory = shared_memory
+        self._memory: FrameMemory | None = None
         self._core = StreamCore(layout, options)
         self._inbox: asyncio.Queue[Event] = asyncio.Queue()
         self._connection: Connection | None = None
@@ -66,7 +70,7 @@ class AsyncStream:
 
     async def __aenter__(self) -> AsyncStream:
         try:
-            self._connect()
+            await self._connect()
             while not self._core.opened:
                 if await self._handle(await self._event()) is not None:
                     raise ServerFault("The server answered before the stream was open.")
@@ -106,7 +110,7 @@ class AsyncStream:
                 if pulling is not None and pulling in done:
                     item, pulling = pulling.result(), None
                     if item is not None:
-                        self._send(*split(item))
+                        await self._send(*split(item))
                     else:
                         exhausted = True
                         if self._core.is_waiting and self._core.grid is None:
@@ -130,7 +134,7 @@ class AsyncStream:
             await asyncio.to_thread(self._connection.join)
         await self._disconnect()
 
-    def _connect(self) -> None:
+    async def _connect(self) -> None:
         inbox: asyncio.Queue[Event] = asyncio.Queue()
         loop = asyncio.get_running_loop()
 
@@ -139,8 +143,14 @@ class AsyncStream:
                 loop.call_soon_threadsafe(inbox.put_nowait, event)
 
         self._inbox = inbox
+        if self._shared_memory is not None:
+            try:
+                self._memory = await asyncio.to_thread(self._core.new_memory, self._shared_memory, self._timeout_s)
+            except (TooManyRegions, Unavailable) as error:  # later it may do
+                inbox.put_nowait(error)
+                return
         self._connection = Connection(self._channel, self._metadata, deliver)
-        for request in self._core.first():
+        for request in self._core.first(self._memory):
             self._connection.send(request)
         if self._finishing:
             self._connection.finish()
@@ -151,16 +161,19 @@ class AsyncStream:
         if connection is not None:
             connection.close()
             await asyncio.to_thread(connection.join)
+        if self._memory is not None:
+            self._memory.close()
+            self._memory = None
 
     def _finish(self) -> None:
         self._finishing = True
         if self._connection is not None:
             self._connection.finish()
 
-    def _send(self, image: types.Image, timestamp_us: int) -> None:
+    async def _send(self, image: types.Image, timestamp_us: int) -> None:
         request = self._core.accept(image, timestamp_us)
         if self._connection is None:
-            self._connect()
+            await self._connect()
         else:
             self._connection.send(request)
 
@@ -184,7 +197,7 @@ class AsyncStream:
         if self._core.is_waiting or not self._core.opened:
             await asyncio.sleep(pause_s)
             self._finishing = finishing
-            self._connect()
+            await self._connect()
 
 
 async def _next(source: AsyncIterator[Item]) -> Item | None:

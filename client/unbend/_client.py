@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Sequence
 from types import TracebackType
@@ -39,6 +40,8 @@ class Client:
         retries: attempts after the first, of calls that may be repeated, when the server is gone or at a limit.
         credentials: of ``grpc.ssl_channel_credentials`` for TLS; None connects in the clear.
         metadata: pairs that are sent with every call, ``("authorization", "Bearer ...")`` for one.
+        shared_memory: the local socket of a service on this host (its setting ``local_socket``): the raw frames of
+            streams then pass through shared memory instead of the connection. Linux only.
     """
 
     def __init__(
@@ -49,11 +52,13 @@ class Client:
         retries: int = 2,
         credentials: grpc.ChannelCredentials | None = None,
         metadata: Sequence[tuple[str, str]] = (),
+        shared_memory: str | os.PathLike[str] | None = None,
     ) -> None:
         self._channel = open_channel(target, credentials)
         self._timeout_s = timeout_s
         self._retries = retries
         self._metadata = tuple(metadata)
+        self._shared_memory = None if shared_memory is None else os.fspath(shared_memory)
         self._closed = False
         self.grids = Grids(self)
 
@@ -219,7 +224,7 @@ class Client:
             reconnects=reconnects,
         )
         layout = FrameLayout.of(pixel_format, width, height)
-        return Stream(self._channel, self._metadata, layout, options, self._timeout_s)
+        return Stream(self._channel, self._metadata, layout, options, self._timeout_s, self._shared_memory)
 
     def _grid_id(self, grid: calls.GridLike | None) -> str | None:
         if isinstance(grid, types.Grid | types.Guides):

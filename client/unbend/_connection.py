@@ -15,10 +15,10 @@ import grpc
 from unbend._channel import Metadata
 from unbend._errors import UnbendError
 from unbend._failures import translate
-from unbend._stream_core import Request, Response
+from unbend._stream_core import Answer, read_response
 
 #: A response, the error that the call ended with, or None for its regular end. Nothing comes after an end.
-Event = Response | UnbendError | None
+Event = Answer | UnbendError | None
 
 _METHOD = "/unbend.v1.CorrectionService/CorrectStream"
 _THREAD_S = 5.0
@@ -32,15 +32,15 @@ class Connection:
     """
 
     def __init__(self, channel: grpc.Channel, metadata: Metadata, deliver: Callable[[Event], None]) -> None:
-        self._requests: queue.SimpleQueue[Request | None] = queue.SimpleQueue()
+        self._requests: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         self._deliver = deliver
-        method = channel.stream_stream(_METHOD, Request.SerializeToString, Response.FromString)
+        method = channel.stream_stream(_METHOD, None, read_response)
         self._call = method(self._outgoing(), metadata=metadata)
         self._thread = threading.Thread(target=self._read, name="unbend-stream", daemon=True)
         self._thread.start()
 
-    def send(self, request: Request) -> None:
-        """Hands a request over; never blocks."""
+    def send(self, request: bytes) -> None:
+        """Hands a serialized request over; never blocks."""
         self._requests.put(request)
 
     def finish(self) -> None:
@@ -56,7 +56,7 @@ class Connection:
         """Waits for the thread, after the end or :meth:`close`."""
         self._thread.join(_THREAD_S)
 
-    def _outgoing(self) -> Iterator[Request]:
+    def _outgoing(self) -> Iterator[bytes]:
         while (request := self._requests.get()) is not None:
             yield request
 

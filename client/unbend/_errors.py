@@ -16,12 +16,15 @@ The tree; what stands in brackets is the builtin that the error also is::
     │   │   └── FoldedGrid
     │   ├── InvalidFrame
     │   ├── UnsupportedPixelFormat
+    │   ├── InvalidRegion
     │   └── ProtocolViolation
     ├── GridNotFound [LookupError]
+    ├── RegionNotFound [LookupError]
     ├── GridConflict
     ├── Overloaded
     │   ├── QueueFull
     │   ├── MemoryFull
+    │   ├── TooManyRegions
     │   └── TooManyStreams
     ├── Unavailable [ConnectionError]
     │   ├── Draining
@@ -162,6 +165,12 @@ class UnsupportedPixelFormat(InvalidInput):
     code = "unsupported_pixel_format"
 
 
+class InvalidRegion(InvalidInput):
+    """Memory that the server cannot share, or a part that does not lie inside of it."""
+
+    code = "invalid_region"
+
+
 class ProtocolViolation(InvalidInput):
     """Messages of a stream in the wrong order."""
 
@@ -172,6 +181,12 @@ class GridNotFound(UnbendError, LookupError):
     """No grid is stored under that id."""
 
     code = "grid_not_found"
+
+
+class RegionNotFound(UnbendError, LookupError):
+    """The server knows no such memory (any more)."""
+
+    code = "region_not_found"
 
 
 class GridConflict(UnbendError):
@@ -196,6 +211,12 @@ class MemoryFull(Overloaded):
     """The requests under way fill the memory that the server grants to all of them together."""
 
     code = "memory_full"
+
+
+class TooManyRegions(Overloaded):
+    """More memory is shared with the server than it allows."""
+
+    code = "too_many_regions"
 
 
 class TooManyStreams(Overloaded):

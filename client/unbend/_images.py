@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -35,12 +36,12 @@ class Packed:
 
     Attributes:
         layout: what the bytes are.
-        data: the bytes.
+        data: the bytes; in streams any contiguous buffer, perhaps that of the caller's array.
         shape: of the array that it was; None if it was bytes.
     """
 
     layout: frame_pb2.FrameFormat
-    data: bytes
+    data: Any
     shape: tuple[int, ...] | None
 
 
@@ -125,12 +126,17 @@ class FrameLayout:
                 f"A {self.pixel_format} frame of {self.width}x{self.height} pixels has {expected} bytes, "
                 f"not {size_bytes}."
             )
-        data = frame.tobytes() if isinstance(frame, np.ndarray) else frame
+        data = np.ascontiguousarray(frame) if isinstance(frame, np.ndarray) else frame
         return Packed(self.message, data, shape)
 
-    def unpack(self, data: bytes, shape: tuple[int, ...] | None) -> npt.NDArray[np.uint8] | bytes:
-        """The answer to a frame: bytes, or a read-only array of the shape that was sent."""
-        return data if shape is None else np.frombuffer(data, np.uint8).reshape(shape)
+    def unpack(self, data: Any, shape: tuple[int, ...] | None) -> npt.NDArray[np.uint8] | bytes:
+        """The answer to a frame, a buffer: bytes, or a read-only array of the shape that was sent."""
+        if shape is None:
+            return bytes(data)
+        shown = data if isinstance(data, np.ndarray) else np.frombuffer(data, np.uint8)
+        shown = shown.reshape(shape)
+        shown.flags.writeable = False
+        return shown
 
     def _check_array(self, frame: np.ndarray, expected: int) -> None:
         if frame.dtype != np.uint8:

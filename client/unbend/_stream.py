@@ -12,8 +12,9 @@ import grpc
 from unbend import _types as types
 from unbend._channel import Metadata
 from unbend._connection import Connection, Event
-from unbend._errors import Closed, DeadlineExceeded, ServerFault, UnbendError
+from unbend._errors import Closed, DeadlineExceeded, ServerFault, TooManyRegions, Unavailable, UnbendError
 from unbend._images import FrameLayout
+from unbend._memory import FrameMemory
 from unbend._stream_core import StreamCore, StreamOptions, split
 
 
@@ -39,10 +40,13 @@ class Stream:
         layout: FrameLayout,
         options: StreamOptions,
         timeout_s: float,
+        shared_memory: str | None = None,
     ) -> None:
         self._channel = channel
         self._metadata = metadata
         self._timeout_s = timeout_s
+        self._shared_memory = shared_memory
+        self._memory: FrameMemory | None = None
         self._core = StreamCore(layout, options)
         self._inbox: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._connection: Connection | None = None
@@ -129,8 +133,14 @@ class Stream:
     def _connect(self) -> None:
         inbox: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._inbox = inbox
+        if self._shared_memory is not None:
+            try:
+                self._memory = self._core.new_memory(self._shared_memory, self._timeout_s)
+            except (TooManyRegions, Unavailable) as error:  # later it may do
+                inbox.put(error)
+                return
         self._connection = Connection(self._channel, self._metadata, inbox.put)
-        for request in self._core.first():
+        for request in self._core.first(self._memory):
             self._connection.send(request)
         if self._finishing:
             self._connection.finish()
@@ -140,6 +150,9 @@ class Stream:
             self._connection.close()
             self._connection.join()
             self._connection = None
+        if self._memory is not None:
+            self._memory.close()
+            self._memory = None
         self._finishing = False
 
     def _finish(self) -> None:

@@ -7,18 +7,41 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import Any
 
 from unbend import _types as types
 from unbend._calls import from_record, to_correct, to_guides, to_rendering
-from unbend._errors import InvalidOption, ServerFault, StreamIdle, TooManyStreams, Unavailable, UnbendError
+from unbend._errors import (
+    InvalidOption,
+    ServerFault,
+    StreamIdle,
+    TooManyRegions,
+    TooManyStreams,
+    Unavailable,
+    UnbendError,
+)
 from unbend._failures import of_frame
 from unbend._foreign import timestamp_us_of
-from unbend._images import FrameLayout
+from unbend._images import ENCODED, FrameLayout, frame_size_bytes
+from unbend._memory import FrameMemory
 from unbend._retries import backoff_s
-from unbend.v1 import correction_pb2
+from unbend._wire import FRAME_DATA_FIELD, FRAME_FIELD, RESULT_DATA_FIELD, RESULT_FIELD, attach, detach
+from unbend.v1 import correction_pb2, memory_pb2
 
 Request = correction_pb2.CorrectStreamRequest
 Response = correction_pb2.CorrectStreamResponse
+
+
+@dataclass(frozen=True, slots=True)
+class FrameAnswer:
+    """A result, and its picture where it lies in the message."""
+
+    result: correction_pb2.StreamResult
+    data: memoryview | bytes
+
+
+#: What the server says.
+Answer = Response | FrameAnswer
 
 WHILE_ESTIMATING = {
     "hold": correction_pb2.WHILE_ESTIMATING_HOLD,
@@ -95,9 +118,18 @@ class StreamOptions:
 
 @dataclass(frozen=True, slots=True)
 class _Sent:
-    """A frame that is not answered yet, as it was sent, and the shape of its array."""
+    """A frame that is not answered yet.
 
-    request: Request
+    Attributes:
+        body: its message, serialized.
+        places: where it lies, if it lies in shared memory.
+        shape: of its array.
+    """
+
+    index: int
+    timestamp_us: int
+    body: bytes
+    places: memory_pb2.SharedPicture | None
     shape: tuple[int, ...] | None
 
 
@@ -106,12 +138,14 @@ class StreamCore:
 
     def __init__(self, layout: FrameLayout, options: StreamOptions) -> None:
         self._layout = layout
+        self._options = options
         self._opening = options.opening(layout)
         self._window = options.in_flight
         self._reconnects = options.reconnects
         self._unanswered: deque[_Sent] = deque()
         self._next_index = 0
         self._failures = 0
+        self._memory: FrameMemory | None = None
         self.opened = False
         self.resumed = False
         self.grid: types.GridRecord | None = None
@@ -130,27 +164,59 @@ class StreamCore:
         """Whether an answer is due."""
         return bool(self._unanswered)
 
-    def first(self) -> list[Request]:
-        """What a connection begins with: the opening, and the frames that no connection before it has answered."""
-        return [Request(open=self._opening), *(sent.request for sent in self._unanswered)]
+    def new_memory(self, path: str, timeout_s: float) -> FrameMemory | None:
+        """Memory for one connection, shared with the server at ``path``; None for files. Raises as FrameMemory."""
+        if self._layout.pixel_format in ENCODED:
+            return None
+        size_bytes = frame_size_bytes(self._layout.pixel_format, self._layout.width, self._layout.height)
+        return FrameMemory(path, size_bytes, self._options.in_flight, timeout_s)
 
-    def accept(self, image: types.Image, timestamp_us: int) -> Request:
-        """The message of the next frame. Raises InvalidFrame."""
+    def first(self, memory: FrameMemory | None = None) -> list[bytes]:
+        """What a connection begins with: the opening, and the frames that no connection before it has answered.
+
+        Args:
+            memory: that frames go through on this connection. The one before is left as it is: the server may still
+                be drawing in it.
+        """
+        before, self._memory = self._memory, memory
+        for _ in range(len(self._unanswered)):
+            sent = self._unanswered.popleft()
+            if memory is not None and sent.places is not None and before is not None:
+                sent = self._through(memory, sent.index, sent.timestamp_us, before.source(sent.places), sent.shape)
+            self._unanswered.append(sent)
+        return [Request(open=self._opening).SerializeToString(), *(sent.body for sent in self._unanswered)]
+
+    def accept(self, image: types.Image, timestamp_us: int) -> bytes:
+        """The message of the next frame, serialized. Raises InvalidFrame."""
         packed = self._layout.pack(image)
-        request = Request()
-        request.frame.index = self._next_index
-        request.frame.timestamp_us = timestamp_us
-        request.frame.data = packed.data  # filled in place: a frame that is put into a request is copied once more
+        if self._memory is not None:
+            sent = self._through(self._memory, self._next_index, timestamp_us, packed.data, packed.shape)
+        else:
+            rest = correction_pb2.StreamFrame(index=self._next_index, timestamp_us=timestamp_us).SerializeToString()
+            body = attach(FRAME_FIELD, rest, FRAME_DATA_FIELD, packed.data)
+            sent = _Sent(self._next_index, timestamp_us, body, None, packed.shape)
         self._next_index += 1
-        self._unanswered.append(_Sent(request, packed.shape))
-        return request
+        self._unanswered.append(sent)
+        return sent.body
+
+    def _through(
+        self, memory: FrameMemory, index: int, timestamp_us: int, data: Any, shape: tuple[int, ...] | None
+    ) -> _Sent:
+        places = memory.put(data)
+        frame = correction_pb2.StreamFrame(index=index, timestamp_us=timestamp_us, shared=places)
+        return _Sent(index, timestamp_us, Request(frame=frame).SerializeToString(), places, shape)
 
     def forget(self) -> None:
         """Nobody waits any more for the frames that are not answered; the connection has to be given up with them."""
+        for sent in self._unanswered:
+            if sent.places is not None and self._memory is not None:
+                self._memory.free(sent.places)
         self._unanswered.clear()
 
-    def receive(self, response: Response) -> types.StreamResult | None:
+    def receive(self, response: Answer) -> types.StreamResult | None:
         """What a response says to the caller, if anything. Raises ServerFault for one that should not have come."""
+        if isinstance(response, FrameAnswer):
+            return self._answer(response.result, response.data)
         match response.WhichOneof("message"):
             case "opened":
                 self._open(response.opened)
@@ -158,7 +224,7 @@ class StreamCore:
                 self.grid = from_record(response.grid.record)
                 self._opening.estimate_again = False  # it was; a resumed stream keeps the grid
             case "result":
-                return self._answer(response.result)
+                return self._answer(response.result, response.result.data)
             case _:
                 raise ServerFault("The server sent a message that is not known here.")
         return None
@@ -173,7 +239,7 @@ class StreamCore:
             if not self._unanswered:
                 return 0.0
             error = ServerFault("The server ended the stream before it had answered every frame.")
-        if not isinstance(error, Unavailable | StreamIdle | TooManyStreams):
+        if not isinstance(error, Unavailable | StreamIdle | TooManyRegions | TooManyStreams):
             raise error
         self._failures += 1
         if self._failures > (self._reconnects if self.opened else min(self._reconnects, _ATTEMPTS_TO_OPEN)):
@@ -186,8 +252,8 @@ class StreamCore:
         self._opening.stream_id = message.stream_id
         self._window = max(1, min(self._window, message.max_in_flight or self._window))
 
-    def _answer(self, message: correction_pb2.StreamResult) -> types.StreamResult:
-        if not self._unanswered or message.index != self._unanswered[0].request.frame.index:
+    def _answer(self, message: correction_pb2.StreamResult, data: memoryview | bytes) -> types.StreamResult:
+        if not self._unanswered or message.index != self._unanswered[0].index:
             raise ServerFault(f"The server answered frame {message.index}, which is not the next one.")
         sent = self._unanswered.popleft()
         self._failures = 0
@@ -195,13 +261,19 @@ class StreamCore:
             raise ServerFault(f"The server answered with the frame status {message.status}, which is not known here.")
         status = STATUSES[message.status]
         image, error = None, None
+        pictured = status in (types.FrameStatus.CORRECTED, types.FrameStatus.PASSED_THROUGH)
+        if sent.places is not None and self._memory is not None:
+            if pictured and message.HasField("shared"):
+                image = self._layout.unpack(self._memory.take(sent.places), sent.shape)
+            else:
+                self._memory.free(sent.places)
         if status is types.FrameStatus.FAILED:
             error = of_frame(message.error.code, message.error.message)
-        elif status is not types.FrameStatus.DROPPED:
-            image = self._layout.unpack(message.data, sent.shape)
+        elif pictured and image is None:
+            image = self._layout.unpack(data, sent.shape)
         return types.StreamResult(
-            sent.request.frame.index,
-            sent.request.frame.timestamp_us,
+            sent.index,
+            sent.timestamp_us,
             status,
             image,
             error,
@@ -214,3 +286,10 @@ class StreamCore:
 def split(item: types.Image | tuple[types.Image, int]) -> tuple[types.Image, int]:
     """A frame and its timestamp in microseconds: that of a PyAV frame, else 0 if it came without."""
     return item if isinstance(item, tuple) else (item, timestamp_us_of(item))
+
+
+def read_response(body: bytes) -> Answer:
+    """A message of the server; the picture of a result is shown where it lies in ``body``."""
+    if (parts := detach(body, RESULT_FIELD, RESULT_DATA_FIELD)) is not None:
+        return FrameAnswer(correction_pb2.StreamResult.FromString(parts[0]), parts[1])
+    return Response.FromString(body)

@@ -16,6 +16,7 @@ import uvicorn
 
 from unbend_service.application.service import Service
 from unbend_service.settings import Settings
+from unbend_service.transport.local.listener import MemoryListener
 from unbend_service.transport.rest.app import create_app
 from unbend_service.transport.rest.connections import guarded_protocol
 from unbend_service.transport.rpc.server import start_server
@@ -51,9 +52,13 @@ async def serve(settings: Settings, on_ready: Callable[[Addresses], None] | None
     _handle_signals(stop)
     http_socket = _bound_socket(settings.http_host, settings.http_port)
     service = build_service(settings)
+    listener: MemoryListener | None = None
     try:
         await service.start()
         rpc_server, rpc_port = await start_server(service, settings)
+        if settings.local_socket is not None:
+            listener = MemoryListener(settings.local_socket, service.regions, settings.streams)
+            listener.start()
         http_server = _HttpServer(
             uvicorn.Config(
                 create_app(service, settings),
@@ -77,6 +82,7 @@ async def serve(settings: Settings, on_ready: Callable[[Addresses], None] | None
             "ready",
             http=addresses.http,
             grpc=addresses.grpc,
+            local_socket=None if settings.local_socket is None else str(settings.local_socket),
             renderer=renderer.name if renderer else None,
             device=renderer.device if renderer else None,
             hardware=renderer.hardware if renderer else None,
@@ -90,6 +96,8 @@ async def serve(settings: Settings, on_ready: Callable[[Addresses], None] | None
         await _drain(service, settings, http_server, serving, rpc_server)
     finally:
         http_socket.close()
+        if listener is not None:
+            listener.close()
         await service.close(0.0)
 
 

@@ -35,6 +35,15 @@ class Settings(BaseSettings):
     queue_frames: int = Field(64, ge=1, description="Frames that may wait for a renderer; one more is refused.")
     render_deadline_s: float = Field(30.0, gt=0, description="Longest time from acceptance to answer of one frame.")
 
+    local_socket: Path | None = Field(
+        None,
+        description="Unix socket (mode 0600, in a folder that others cannot write to) over which clients of this host "
+        "share memory for the raw frames of streams; unset: off.",
+    )
+    local_memory_bytes: int = Field(
+        1 << 30, ge=1 << 20, description="Upper bound of the memory that clients share, all together."
+    )
+
     model: str = Field("lineset", description="Estimator: the name of a model that ships, or a path to one.")
     estimator_threads: int = Field(0, ge=0, le=256, description="Threads of one estimate; 0: as many as usable cores.")
     known_images: int = Field(

@@ -20,6 +20,7 @@ from unbend_service.application.fitting import FittedGrids
 from unbend_service.application.grids import GridLibrary
 from unbend_service.application.illustration import Illustration
 from unbend_service.application.ports import GridStore
+from unbend_service.application.regions import Regions
 from unbend_service.application.service import Service
 from unbend_service.application.streams import Streams
 from unbend_service.settings import Settings
@@ -79,7 +80,8 @@ def build_service(settings: Settings, meter: PrometheusMeter | None = None) -> S
     )
     grids = GridLibrary(store, blocking, grid_points=settings.grid_points)
     exchange = Exchange(ExchangeFiles(), fitted_grids, blocking)
-    streams = Streams(estimation, correction, store, codec, blocking, meter, settings)
+    regions = Regions(pool, settings.local_memory_bytes)
+    streams = Streams(estimation, correction, store, codec, blocking, meter, regions, settings)
     return Service(
         estimation,
         correction,
@@ -87,6 +89,7 @@ def build_service(settings: Settings, meter: PrometheusMeter | None = None) -> S
         grids,
         exchange,
         streams,
+        regions,
         pool,
         store,
         codec,

@@ -19,6 +19,8 @@ from unbend_service.application.blocking import BlockingWork
 from unbend_service.application.correction import Correction, CorrectOptions
 from unbend_service.application.estimation import Estimation
 from unbend_service.application.fitting import FittedGrids
+from unbend_service.application.ports import SharedPicture
+from unbend_service.application.regions import Regions
 from unbend_service.application.stream_messages import (
     Delivery,
     DrawnGuides,
@@ -73,7 +75,14 @@ class UnsteadyPool(FakeRenderPool):
     chance: random.Random = field(default_factory=lambda: random.Random(7))
 
     async def render(
-        self, frame: Frame, grid: Grid, border: Border, *, affinity: str | None = None, deadline_s: float | None = None
+        self,
+        frame: Frame,
+        grid: Grid,
+        border: Border,
+        *,
+        affinity: str | None = None,
+        deadline_s: float | None = None,
+        shared: SharedPicture | None = None,
     ) -> np.ndarray:
         self.under_way += 1
         self.most_under_way = max(self.most_under_way, self.under_way)
@@ -83,7 +92,7 @@ class UnsteadyPool(FakeRenderPool):
                 await self.gate.wait()
             if errors := self.failures.get(int(frame.data[0])):
                 raise errors.pop(0)
-            return await super().render(frame, grid, border, affinity=affinity, deadline_s=deadline_s)
+            return await super().render(frame, grid, border, affinity=affinity, deadline_s=deadline_s, shared=shared)
         finally:
             self.under_way -= 1
 
@@ -133,7 +142,8 @@ async def build() -> AsyncIterator[Build]:
             estimator, codec, store, grids, blocking, meter, grid_points=settings.grid_points, min_confidence=0.5
         )
         correction = Correction(estimation, codec, store, grids, pool, blocking, meter, jpeg_quality=92, deadline_s=1.0)
-        streams = Streams(estimation, correction, store, codec, blocking, meter, settings)
+        regions = Regions(pool, settings.local_memory_bytes)
+        streams = Streams(estimation, correction, store, codec, blocking, meter, regions, settings)
         return Bench(streams, pool, estimator, meter, store)
 
     yield make

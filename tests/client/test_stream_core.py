@@ -12,12 +12,17 @@ from unbend._images import FrameLayout
 from unbend._stream_core import StreamCore, StreamOptions
 from unbend.v1 import correction_pb2, grid_pb2
 
+Request = correction_pb2.CorrectStreamRequest
 Response = correction_pb2.CorrectStreamResponse
 LAYOUT = FrameLayout.of("gray8", 2, 1)
 
 
 def opened(max_in_flight: int = 8) -> Response:
     return Response(opened=correction_pb2.StreamOpened(stream_id="camera-7", max_in_flight=max_in_flight))
+
+
+def frame_of(body: bytes) -> correction_pb2.StreamFrame:
+    return Request.FromString(body).frame
 
 
 def answer(frame: correction_pb2.StreamFrame) -> Response:
@@ -42,7 +47,7 @@ def test_whenever_the_connection_breaks_each_frame_is_answered_once_and_in_order
 
     for step in steps:
         if step == "send" and core.has_room:
-            on_the_server.append(core.accept(np.full((1, 2), sent, np.uint8), sent).frame)
+            on_the_server.append(frame_of(core.accept(np.full((1, 2), sent, np.uint8), sent)))
             sent += 1
         elif step == "answer" and on_the_server:
             result = core.receive(answer(on_the_server.pop(0)))
@@ -51,8 +56,8 @@ def test_whenever_the_connection_breaks_each_frame_is_answered_once_and_in_order
         elif step == "break":
             core.lost(unbend.Unreachable("Cut."))
             first, *again = core.first()
-            assert first.open.stream_id == "camera-7"
-            on_the_server = [request.frame for request in again]
+            assert Request.FromString(first).open.stream_id == "camera-7"
+            on_the_server = [frame_of(request) for request in again]
         assert len(on_the_server) <= in_flight
     for frame in on_the_server:
         result = core.receive(answer(frame))
@@ -67,13 +72,13 @@ def test_whenever_the_connection_breaks_each_frame_is_answered_once_and_in_order
 
 def test_an_answer_out_of_turn_is_a_fault_of_the_server() -> None:
     core = started()
-    first, second = core.accept(b"ab", 0), core.accept(b"cd", 0)
+    first, second = frame_of(core.accept(b"ab", 0)), frame_of(core.accept(b"cd", 0))
 
     with pytest.raises(unbend.ServerFault):
-        core.receive(answer(second.frame))
-    core.receive(answer(first.frame))
+        core.receive(answer(second))
+    core.receive(answer(first))
     with pytest.raises(unbend.ServerFault):
-        core.receive(answer(first.frame))
+        core.receive(answer(first))
 
 
 def test_the_server_may_narrow_the_window_but_not_widen_it() -> None:
@@ -87,18 +92,18 @@ def test_the_server_may_narrow_the_window_but_not_widen_it() -> None:
 
 def test_a_new_estimate_that_was_made_is_not_asked_for_again_after_a_break() -> None:
     core = started(estimate_again=True)
-    assert core.first()[0].open.estimate_again
+    assert Request.FromString(core.first()[0]).open.estimate_again
 
     record = grid_pb2.GridRecord(grid_id="g1", outcome=grid_pb2.OUTCOME_CORRECTED)
     core.receive(Response(grid=correction_pb2.StreamGrid(record=record)))
 
-    assert not core.first()[0].open.estimate_again
+    assert not Request.FromString(core.first()[0]).open.estimate_again
 
 
 def test_attempts_are_counted_anew_after_each_answer() -> None:
     core = started(reconnects=1)
     for _ in range(3):
-        frame = core.accept(b"ab", 0).frame
+        frame = frame_of(core.accept(b"ab", 0))
         core.lost(unbend.Unreachable("Cut."))
         core.receive(answer(frame))
     core.lost(unbend.Unreachable("Cut."))

@@ -8,6 +8,7 @@ from google.protobuf import message as _message
 from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
 from unbend.v1 import frame_pb2 as _frame_pb2
 from unbend.v1 import grid_pb2 as _grid_pb2
+from unbend.v1 import memory_pb2 as _memory_pb2
 import builtins as _builtins
 import sys
 import typing as _typing
@@ -336,22 +337,28 @@ class StreamFrame(_message.Message):
     INDEX_FIELD_NUMBER: _builtins.int
     TIMESTAMP_US_FIELD_NUMBER: _builtins.int
     DATA_FIELD_NUMBER: _builtins.int
+    SHARED_FIELD_NUMBER: _builtins.int
     index: _builtins.int
     """Chosen by the client, strictly increasing within a connection; comes back with the result."""
     timestamp_us: _builtins.int
     """Presentation time in microseconds, any origin; comes back with the result."""
     data: _builtins.bytes
-    """The picture, in the layout of the stream."""
+    """The picture, in the layout of the stream; empty with shared."""
+    @_builtins.property
+    def shared(self) -> _memory_pb2.SharedPicture:
+        """Instead of data, in streams of a raw format: the picture lies in shared memory, and so will its answer."""
+
     def __init__(
         self,
         *,
         index: _builtins.int = ...,
         timestamp_us: _builtins.int = ...,
         data: _builtins.bytes = ...,
+        shared: _memory_pb2.SharedPicture | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["shared", b"shared"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["data", b"data", "index", b"index", "timestamp_us", b"timestamp_us"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["data", b"data", "index", b"index", "shared", b"shared", "timestamp_us", b"timestamp_us"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -460,6 +467,7 @@ class StreamResult(_message.Message):
     STATUS_FIELD_NUMBER: _builtins.int
     DATA_FIELD_NUMBER: _builtins.int
     ERROR_FIELD_NUMBER: _builtins.int
+    SHARED_FIELD_NUMBER: _builtins.int
     index: _builtins.int
     """Of the frame."""
     timestamp_us: _builtins.int
@@ -467,10 +475,14 @@ class StreamResult(_message.Message):
     status: Global___FrameStatus.ValueType
     """What became of it."""
     data: _builtins.bytes
-    """The picture, in the layout of the stream."""
+    """The picture, in the layout of the stream; empty with shared."""
     @_builtins.property
     def error(self) -> Global___FrameError:
         """With FRAME_STATUS_FAILED: the error."""
+
+    @_builtins.property
+    def shared(self) -> _memory_pb2.SharedPicture:
+        """Instead of data, of a frame that came in shared memory: its answer lies at target_offset."""
 
     def __init__(
         self,
@@ -480,10 +492,11 @@ class StreamResult(_message.Message):
         status: Global___FrameStatus.ValueType = ...,
         data: _builtins.bytes = ...,
         error: Global___FrameError | None = ...,
+        shared: _memory_pb2.SharedPicture | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["error", b"error"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["error", b"error", "shared", b"shared"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["data", b"data", "error", b"error", "index", b"index", "status", b"status", "timestamp_us", b"timestamp_us"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["data", b"data", "error", b"error", "index", b"index", "shared", b"shared", "status", b"status", "timestamp_us", b"timestamp_us"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

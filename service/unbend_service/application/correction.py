@@ -7,7 +7,15 @@ from dataclasses import dataclass, replace
 from unbend_service.application.blocking import BlockingWork
 from unbend_service.application.estimation import Estimation
 from unbend_service.application.fitting import FittedGrids
-from unbend_service.application.ports import Bytes, DecodedImage, GridStore, ImageCodec, Meter, RenderPool
+from unbend_service.application.ports import (
+    Bytes,
+    DecodedImage,
+    GridStore,
+    ImageCodec,
+    Meter,
+    RenderPool,
+    SharedPicture,
+)
 from unbend_service.domain.errors import InvalidOption, UnbendError
 from unbend_service.domain.fit import CROP, Fit
 from unbend_service.domain.frames import BLACK, Border, Frame, with_alpha
@@ -138,9 +146,19 @@ class Correction:
         """
         return await self._grids.get(record.grid, options.fit, options.strength)
 
-    async def draw(self, frame: Frame, grid: Grid, border: Border, *, affinity: str | None = None) -> Bytes:
+    async def draw(
+        self,
+        frame: Frame,
+        grid: Grid,
+        border: Border,
+        *,
+        affinity: str | None = None,
+        shared: SharedPicture | None = None,
+    ) -> Bytes:
         """The picture of a fitted grid, (frame_size_bytes,) uint8; counts nothing, so that it may be tried again."""
-        return await self._pool.render(frame, grid, border, affinity=affinity, deadline_s=self._deadline_s)
+        return await self._pool.render(
+            frame, grid, border, affinity=affinity, deadline_s=self._deadline_s, shared=shared
+        )
 
     async def encode(self, image: DecodedImage, image_format: str, options: CorrectOptions) -> bytes:
         """The file of a picture, jpeg, png or webp."""

@@ -128,6 +128,36 @@ class PoolState:
     workers: list[WorkerState] = field(default_factory=list)
 
 
+class SharedMemory(Protocol):
+    """Memory of a client on the same host, seen by this process and by the workers."""
+
+    @property
+    def size_bytes(self) -> int: ...
+
+    @property
+    def memory(self) -> Bytes:
+        """(size_bytes,) uint8 view, writable; the client may write too, at any moment."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class SharedPicture:
+    """A raw picture in the memory of a client.
+
+    Attributes:
+        memory: whose.
+        source_offset: bytes from its start to the picture.
+        target_offset: bytes from its start to where the answer is put.
+        source, target: (size,) uint8 views of the same, which keep the memory mapped.
+    """
+
+    memory: SharedMemory
+    source_offset: int
+    target_offset: int
+    source: Bytes
+    target: Bytes
+
+
 class RenderPool(Protocol):
     """Renders frames in worker processes."""
 
@@ -140,19 +170,42 @@ class RenderPool(Protocol):
         ...
 
     async def render(
-        self, frame: Frame, grid: Grid, border: Border, *, affinity: str | None = None, deadline_s: float | None = None
+        self,
+        frame: Frame,
+        grid: Grid,
+        border: Border,
+        *,
+        affinity: str | None = None,
+        deadline_s: float | None = None,
+        shared: SharedPicture | None = None,
     ) -> Bytes:
         """The corrected frame, (frame_size_bytes,) uint8, owned by the caller.
 
         A worker that dies while it has the frame is replaced and the frame is rendered by another.
 
         Args:
+            shared: where the frame lies, if it lies in the memory of a client: the workers read it there and put the
+                answer into its ``target``, which is returned. However the call ends, nobody writes there afterwards,
+                except when it is cancelled.
             affinity: frames with the same key prefer the same worker, whose maps and textures are warm.
             deadline_s: seconds from now after which the answer is worthless.
 
         Raises:
             QueueFull, DeadlineExceeded, PoisonFrame, RendererUnavailable, Draining.
+            RegionNotFound: the client has taken its memory back.
         """
+        ...
+
+    def adopt(self, fd: int, size_bytes: int) -> SharedMemory:
+        """Maps memory of a client, whose descriptor belongs to the pool from now on, whatever happens.
+
+        Raises:
+            InvalidRegion: it is not memory that stays, or smaller than ``size_bytes``.
+        """
+        ...
+
+    def disown(self, memory: SharedMemory) -> None:
+        """Unmaps memory of a client everywhere, once no frame that is under way needs it."""
         ...
 
     def state(self) -> PoolState: ...

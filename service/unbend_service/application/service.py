@@ -14,6 +14,7 @@ from unbend_service.application.exchange import Exchange
 from unbend_service.application.grids import GridLibrary
 from unbend_service.application.illustration import Illustration
 from unbend_service.application.ports import GridStore, ImageCodec, Meter, ModelInfo, PoolState, RenderPool
+from unbend_service.application.regions import Regions
 from unbend_service.application.streams import Streams
 
 
@@ -47,6 +48,7 @@ class Service:
     grids: GridLibrary
     exchange: Exchange
     streams: Streams
+    regions: Regions
     pool: RenderPool
     store: GridStore
     codec: ImageCodec

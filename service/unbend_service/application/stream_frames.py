@@ -8,7 +8,8 @@ import numpy as np
 
 from unbend_service.application.blocking import BlockingWork
 from unbend_service.application.correction import Correction
-from unbend_service.application.ports import DecodedImage, ImageCodec, Meter
+from unbend_service.application.ports import Bytes, DecodedImage, ImageCodec, Meter, SharedPicture
+from unbend_service.application.regions import Regions
 from unbend_service.application.stream_grid import FixedGrid, StreamGrid
 from unbend_service.application.stream_messages import (
     EncodedFormat,
@@ -21,9 +22,18 @@ from unbend_service.application.stream_messages import (
 )
 from unbend_service.application.turns import Turns
 from unbend_service.domain.errors import BodyTooLarge, InvalidFrame, Unavailable, UnbendError
-from unbend_service.domain.frames import Frame
+from unbend_service.domain.frames import Frame, frame_size_bytes
 from unbend_service.domain.grid import Grid
 from unbend_service.settings import Settings
+
+
+@dataclass(frozen=True, slots=True)
+class _Picture:
+    """A frame's picture, with the file that it came from or the shared memory that it lies in."""
+
+    frame: Frame
+    image: DecodedImage | None = None
+    shared: SharedPicture | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +48,7 @@ class FrameAnswers:
     blocking: BlockingWork
     meter: Meter
     turns: Turns
+    regions: Regions
     settings: Settings
 
     async def of_frame(self, frame: StreamFrame, fixed: FixedGrid | None) -> StreamResult:
@@ -56,7 +67,9 @@ class FrameAnswers:
             fixed = await self.grid.fixed()
         if fixed is None or fixed.fitted is None:
             self.meter.frame("passed_through" if fixed is None else "left_alone")
-            return StreamResult(frame.index, frame.timestamp_us, FrameStatus.PASSED_THROUGH, frame.data)
+            if picture.shared is not None:
+                np.copyto(picture.shared.target, picture.shared.source)
+            return self._answer(frame, FrameStatus.PASSED_THROUGH, frame.data)
         try:
             data = await self._corrected(picture, fixed.fitted)
         except Unavailable:
@@ -64,9 +77,14 @@ class FrameAnswers:
         except UnbendError as error:
             return self._failed(frame, error)
         self.meter.frame("corrected")
-        return StreamResult(frame.index, frame.timestamp_us, FrameStatus.CORRECTED, data)
+        return self._answer(frame, FrameStatus.CORRECTED, data)
 
-    async def _picture(self, frame: StreamFrame, fixed: FixedGrid | None) -> DecodedImage | Frame:
+    def _answer(self, frame: StreamFrame, status: FrameStatus, data: bytes | memoryview | Bytes) -> StreamResult:
+        if frame.shared is not None:
+            return StreamResult(frame.index, frame.timestamp_us, status, shared=frame.shared)
+        return StreamResult(frame.index, frame.timestamp_us, status, data)
+
+    async def _picture(self, frame: StreamFrame, fixed: FixedGrid | None) -> _Picture:
         """The picture of a frame, offered for the estimate if the grid is open.
 
         Frames that will come back as they are are decoded all the same: a broken one is answered as failed whether
@@ -79,15 +97,30 @@ class FrameAnswers:
         except BaseException:
             self.grid.lose()
             raise
-        await self.grid.offer(picture if isinstance(picture, Frame) else picture.frame)
+        await self.grid.offer(picture.frame)
         return picture
 
-    async def _decoded(self, frame: StreamFrame) -> DecodedImage | Frame:
+    async def _decoded(self, frame: StreamFrame) -> _Picture:
         match self.config.frame_format:
             case RawFormat(pixel_format, width, height):
-                return Frame(pixel_format, width, height, np.frombuffer(frame.data, np.uint8))
+                if frame.shared is None:
+                    return _Picture(Frame(pixel_format, width, height, np.frombuffer(frame.data, np.uint8)))
+                if frame.data:
+                    raise InvalidFrame("A frame with a picture and shared memory.", allowed="one of them")
+                places = frame.shared
+                shared = self.regions.picture(
+                    places.region_id,
+                    places.source_offset,
+                    places.target_offset,
+                    places.size_bytes,
+                    frame_size_bytes(pixel_format, width, height),
+                )
+                return _Picture(Frame(pixel_format, width, height, shared.source), shared=shared)
             case EncodedFormat(image_format):
-                return await self._decoded_file(frame.data, image_format)
+                if frame.shared is not None:
+                    raise InvalidFrame("A file in shared memory.", allowed="files as data, raw pictures as either")
+                image = await self._decoded_file(bytes(frame.data), image_format)
+                return _Picture(image.frame, image=image)
 
     async def _decoded_file(self, body: bytes, image_format: str) -> DecodedImage:
         bound = self.settings.body_bytes
@@ -98,13 +131,14 @@ class FrameAnswers:
             raise InvalidFrame(f"A {image.image_format} file in a stream of {image_format} files.")
         return image
 
-    async def _corrected(self, picture: DecodedImage | Frame, grid: Grid) -> bytes:
-        frame = picture if isinstance(picture, Frame) else picture.frame
-        border = self.config.options.border
-        data = await self.turns.run(lambda: self.correction.draw(frame, grid, border, affinity=self.stream_id))
-        if isinstance(picture, Frame):
-            return data.tobytes()
-        drawn = replace(picture, frame=replace(frame, data=data))
+    async def _corrected(self, picture: _Picture, grid: Grid) -> bytes | Bytes:
+        frame, image, border = picture.frame, picture.image, self.config.options.border
+        data = await self.turns.run(
+            lambda: self.correction.draw(frame, grid, border, affinity=self.stream_id, shared=picture.shared)
+        )
+        if image is None:
+            return data
+        drawn = replace(image, frame=replace(frame, data=data))
         return await self.turns.run(lambda: self.correction.encode(drawn, drawn.image_format, self.config.options))
 
     def _failed(self, frame: StreamFrame, error: UnbendError) -> StreamResult:

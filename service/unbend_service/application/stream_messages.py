@@ -10,7 +10,7 @@ from unbend_service.application.correction import WRITTEN_FORMATS, CorrectOption
 from unbend_service.application.estimation import check_confidence
 from unbend_service.domain.errors import InvalidFrame, InvalidOption, TooManyPixels, UnbendError, UnsupportedPixelFormat
 from unbend_service.domain.fit import check_strength
-from unbend_service.domain.frames import PixelFormat
+from unbend_service.domain.frames import Bytes, PixelFormat
 from unbend_service.domain.guides import Guides
 from unbend_service.domain.records import GridRecord
 
@@ -137,18 +137,36 @@ class StreamConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class SharedPlaces:
+    """Where a client says that a picture lies, and where it wants the answer; not checked yet.
+
+    Attributes:
+        region_id: of registered memory.
+        source_offset, target_offset: bytes from its start.
+        size_bytes: of the picture, and of its answer.
+    """
+
+    region_id: str
+    source_offset: int
+    target_offset: int
+    size_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
 class StreamFrame:
     """One frame.
 
     Attributes:
         index: strictly increasing within a connection; comes back with the result.
         timestamp_us: presentation time in microseconds, any origin; comes back with the result.
-        data: the picture, in the layout of the stream.
+        data: the picture, in the layout of the stream; empty with ``shared``.
+        shared: where the picture lies in the memory of the client, if it does.
     """
 
     index: int
     timestamp_us: int
-    data: bytes
+    data: bytes | memoryview
+    shared: SharedPlaces | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,15 +183,17 @@ class StreamResult:
     Attributes:
         index, timestamp_us: of the frame.
         status: what became of it.
-        data: the picture; empty for a frame that was dropped or failed.
+        data: the picture, bytes or a (size,) uint8 array; empty for a frame that was dropped or failed.
         error: why it failed.
+        shared: with a picture that was put into the memory of the client instead.
     """
 
     index: int
     timestamp_us: int
     status: FrameStatus
-    data: bytes = b""
+    data: bytes | memoryview | Bytes = b""
     error: UnbendError | None = None
+    shared: SharedPlaces | None = None
 
 
 StreamEvent = GridFixed | StreamResult

@@ -11,6 +11,7 @@ from unbend_service.application.blocking import BlockingWork
 from unbend_service.application.correction import Correction
 from unbend_service.application.estimation import Estimation
 from unbend_service.application.ports import GridStore, ImageCodec, Meter
+from unbend_service.application.regions import Regions
 from unbend_service.application.stream_frames import FrameAnswers
 from unbend_service.application.stream_grid import StreamGrid
 from unbend_service.application.stream_messages import StreamConfig
@@ -31,6 +32,7 @@ class Streams:
         codec: ImageCodec,
         blocking: BlockingWork,
         meter: Meter,
+        regions: Regions,
         settings: Settings,
     ) -> None:
         self._estimation = estimation
@@ -39,6 +41,7 @@ class Streams:
         self._codec = codec
         self._blocking = blocking
         self._meter = meter
+        self._regions = regions
         self._settings = settings
         self._turns = Turns(max(1, settings.queue_frames // 2), settings.render_deadline_s)
         self._live: dict[str, StreamSession] = {}
@@ -118,6 +121,7 @@ class Streams:
             self._blocking,
             self._meter,
             self._turns,
+            self._regions,
             self._settings,
         )
         return StreamSession(stream_id, config, grid, answers, owner)

@@ -16,12 +16,15 @@ The tree (each leaf has a stable ``code``, which both transports put on the wire
     │   │   └── FoldedGrid
     │   ├── InvalidFrame
     │   ├── UnsupportedPixelFormat
+    │   ├── InvalidRegion
     │   └── ProtocolViolation
     ├── GridNotFound
+    ├── RegionNotFound
     ├── GridConflict
     ├── Overloaded
     │   ├── QueueFull
     │   ├── MemoryFull
+    │   ├── TooManyRegions
     │   └── TooManyStreams
     ├── Unavailable
     │   ├── Draining
@@ -157,6 +160,12 @@ class UnsupportedPixelFormat(InvalidInput):
     code = "unsupported_pixel_format"
 
 
+class InvalidRegion(InvalidInput):
+    """Memory of a client that cannot be shared, or a part that does not lie inside of it."""
+
+    code = "invalid_region"
+
+
 class ProtocolViolation(InvalidInput):
     """Messages of a stream in the wrong order."""
 
@@ -167,6 +176,12 @@ class GridNotFound(UnbendError, LookupError):
     """No grid is stored under that id."""
 
     code = "grid_not_found"
+
+
+class RegionNotFound(UnbendError, LookupError):
+    """No memory is registered under that id (any more)."""
+
+    code = "region_not_found"
 
 
 class GridConflict(UnbendError):
@@ -191,6 +206,12 @@ class MemoryFull(Overloaded):
     """The requests under way fill the memory that is granted to all of them together."""
 
     code = "memory_full"
+
+
+class TooManyRegions(Overloaded):
+    """Clients share more memory than is allowed."""
+
+    code = "too_many_regions"
 
 
 class TooManyStreams(Overloaded):

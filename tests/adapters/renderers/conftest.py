@@ -46,7 +46,7 @@ def meter() -> RecordingMeter:
 @pytest.fixture
 async def make_pool(meter: RecordingMeter, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> AsyncIterator[MakePool]:
     """Starts pools of misbehaving renderers with these settings; closes them after the test and sees that they went."""
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
     monkeypatch.setenv("UNBEND_TEST_MARK", str(tmp_path / "mark"))
     pools: list[WorkerPool] = []
 

@@ -49,24 +49,34 @@ class UnmapSlots:
 
 
 @dataclass(frozen=True, slots=True)
+class Place:
+    """Where bytes begin: in which mapped memory, and how far from its start."""
+
+    slot: int
+    offset: int
+
+
+@dataclass(frozen=True, slots=True)
 class Task:
-    """To a worker: render one frame. The slot holds the source, then the target, then the lattice if it is sent.
+    """To a worker: render one frame.
 
     Attributes:
+        source, target: the frame, and where its answer is to be put; they do not overlap.
         forget: grids that the worker need not keep any more.
-        lattice: (rows, columns) of the float32 lattice in the slot; None where the worker has the grid.
-        lattice_offset: bytes from the start of the slot.
+        lattice: (rows, columns) of the float32 lattice; None where the worker has the grid.
+        lattice_place: where the lattice begins.
     """
 
     number: int
-    slot: int
+    source: Place
+    target: Place
     pixel_format: PixelFormat
     width: int
     height: int
     border: Border
     grid_id: str
     lattice: tuple[int, int] | None
-    lattice_offset: int
+    lattice_place: Place
     forget: tuple[str, ...]
 
 

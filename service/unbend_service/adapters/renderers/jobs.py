@@ -5,11 +5,13 @@ from __future__ import annotations
 import asyncio
 import hashlib
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
+from unbend_service.adapters.renderers.channel import Place
+from unbend_service.adapters.renderers.regions import Region
 from unbend_service.adapters.renderers.slots import Slot
-from unbend_service.application.ports import Bytes
+from unbend_service.application.ports import Bytes, SharedPicture
 from unbend_service.domain.frames import Border, Frame
 from unbend_service.domain.grid import Grid
 
@@ -23,8 +25,11 @@ class Job:
         preferred: index of the worker whose maps and textures are warm for it, -1 if none is.
         accepted_s: loop time of acceptance.
         answer: what the caller waits for; done early when the caller has gone.
-        slot: shared memory, from the first assignment to the answer.
-        copied: whether the source is in the slot.
+        released: set when nobody draws the frame any more, whatever became of it.
+        shared: where the frame lies in the memory of a client, if it does.
+        region: that memory, from acceptance to ``released``.
+        slot: shared memory of our own, from the first assignment to the answer.
+        copied: whether the source is in the slot, or need not be.
         blame: grows with every worker that dies while it renders this very frame.
         passed_over: how often a later frame was taken first because it suited the worker.
     """
@@ -36,6 +41,9 @@ class Job:
     preferred: int
     accepted_s: float
     answer: asyncio.Future[Bytes]
+    released: asyncio.Event = field(default_factory=asyncio.Event)
+    shared: SharedPicture | None = None
+    region: Region | None = None
     slot: Slot | None = None
     copied: bool = False
     blame: int = 0
@@ -47,12 +55,21 @@ class Job:
 
     @property
     def lattice_offset(self) -> int:
-        """Where the lattice lies in the slot, after source and target; a multiple of 8 bytes."""
-        return -(-2 * self.size_bytes // 8) * 8
+        """Where the lattice lies in the slot, after source and target if they are there; a multiple of 8 bytes."""
+        return 0 if self.shared is not None else -(-2 * self.size_bytes // 8) * 8
 
     @property
     def slot_bytes(self) -> int:
         return self.lattice_offset + self.grid.source.nbytes
+
+    def places(self) -> tuple[Place, Place]:
+        """Where source and target lie. Raises RuntimeError before a slot is there."""
+        if self.slot is None:
+            raise RuntimeError("a job has no slot")
+        if self.shared is not None and self.region is not None:
+            number = self.region.number
+            return Place(number, self.shared.source_offset), Place(number, self.shared.target_offset)
+        return Place(self.slot.number, 0), Place(self.slot.number, self.size_bytes)
 
 
 @lru_cache(maxsize=4096)

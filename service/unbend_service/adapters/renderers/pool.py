@@ -13,11 +13,12 @@ from unbend_service.adapters.renderers.channel import Done, Failed
 from unbend_service.adapters.renderers.copies import Copies
 from unbend_service.adapters.renderers.jobs import Job, JobQueue, preferred_worker
 from unbend_service.adapters.renderers.leases import Lending
+from unbend_service.adapters.renderers.regions import Region, RegionKeeper
 from unbend_service.adapters.renderers.selection import RendererOptions
 from unbend_service.adapters.renderers.slots import SlotPool
 from unbend_service.adapters.renderers.supervision import Supervisor
 from unbend_service.adapters.renderers.worker_process import WorkerProcess
-from unbend_service.application.ports import Bytes, Meter, PoolState
+from unbend_service.application.ports import Bytes, Meter, PoolState, SharedMemory, SharedPicture
 from unbend_service.domain.errors import (
     DeadlineExceeded,
     Draining,
@@ -47,7 +48,7 @@ class WorkerPool:
     it, and stays there until it is answered, so a frame whose worker dies is given to another. The answer stays in
     shared memory too, lent to the caller until he lets go of it; only when answers that nobody lets go of would take
     more than half of the memory are they copied out. Cost of a frame beyond its rendering: one copy of its bytes and
-    two short messages.
+    two short messages. A frame in the memory of a client is drawn there, without any copy.
 
     Args:
         settings: workers, slots_per_worker, shared_memory_bytes, queue_frames, render_deadline_s, renderer,
@@ -78,6 +79,7 @@ class WorkerPool:
             map_cache_bytes=settings.map_cache_bytes,
         )
         self._supervisor = Supervisor(renderer_factory, options, settings.render_deadline_s, self)
+        self._regions = RegionKeeper(self._slots.next_number, self._supervisor.unmap)
 
     async def start(self) -> None:
         """Starts one worker, learns from it what the renderer is, and then starts the others.
@@ -95,16 +97,28 @@ class WorkerPool:
         self._supervisor.start_others(count)
 
     async def render(
-        self, frame: Frame, grid: Grid, border: Border, *, affinity: str | None = None, deadline_s: float | None = None
+        self,
+        frame: Frame,
+        grid: Grid,
+        border: Border,
+        *,
+        affinity: str | None = None,
+        deadline_s: float | None = None,
+        shared: SharedPicture | None = None,
     ) -> Bytes:
         """See :class:`~unbend_service.application.ports.RenderPool`; ``render_deadline_s`` bounds every deadline.
 
         Raises:
-            QueueFull, DeadlineExceeded, PoisonFrame, RenderFailed, InvalidFrame, RendererUnavailable, Draining.
+            QueueFull, DeadlineExceeded, PoisonFrame, RenderFailed, InvalidFrame, RendererUnavailable, Draining,
+            RegionNotFound.
         """
         loop = asyncio.get_running_loop()
         limit_s = min(self._settings.render_deadline_s, math.inf if deadline_s is None else deadline_s)
         self._check_accepting(limit_s)
+        region: Region | None = None
+        if shared is not None:
+            region = self._regions.known(shared.memory)
+            region.enter()
         self._accepted += 1
         job = Job(
             number=self._accepted,
@@ -114,6 +128,9 @@ class WorkerPool:
             preferred=preferred_worker(affinity, self._supervisor.count),
             accepted_s=loop.time(),
             answer=loop.create_future(),
+            shared=shared,
+            region=region,
+            copied=shared is not None,
         )
         self._jobs.add(job)
         self._queue.append(job)
@@ -122,6 +139,8 @@ class WorkerPool:
             async with asyncio.timeout_at(job.accepted_s + limit_s):
                 return await job.answer
         except TimeoutError:
+            if shared is not None and job not in self._queue:
+                await job.released.wait()  # nobody may draw in the client's memory any more; who hangs is killed
             raise DeadlineExceeded(
                 f"The frame was not rendered within {limit_s:g} s.", setting="render_deadline_s"
             ) from None
@@ -131,6 +150,14 @@ class WorkerPool:
                 self._dispatch()
             elif job.answer.done() and not job.answer.cancelled():
                 job.answer.exception()  # seen, even where the caller went in the very moment of the answer
+
+    def adopt(self, fd: int, size_bytes: int) -> SharedMemory:
+        """See :class:`~unbend_service.application.ports.RenderPool`."""
+        return self._regions.adopt(fd, size_bytes)
+
+    def disown(self, memory: SharedMemory) -> None:
+        """See :class:`~unbend_service.application.ports.RenderPool`."""
+        self._regions.disown(memory)
 
     def _check_accepting(self, limit_s: float) -> None:
         if self._closed:
@@ -172,10 +199,12 @@ class WorkerPool:
             await self._copies.close()
             self._queue = JobQueue()
             for job in self._jobs:
-                job.slot = None
+                job.slot = job.region = None
+                job.released.set()
                 _settle(job, Draining("The service shut down before the frame was rendered."))
             self._jobs.clear()
             self._slots.close()
+            self._regions.close()
             if self._meter_timer is not None:
                 self._meter_timer.cancel()
             self._meter.pool(self.state())
@@ -261,10 +290,11 @@ class WorkerPool:
 
     def _assign(self, job: Job, worker: WorkerProcess) -> None:
         worker.held.add(job)
+        if not job.copied or (job.shared is not None and not job.blame):
+            self._meter.stage("queue", asyncio.get_running_loop().time() - job.accepted_s)
         if job.copied:
             self._supervisor.send(job, worker)
             return
-        self._meter.stage("queue", asyncio.get_running_loop().time() - job.accepted_s)
         if job.slot is None:
             raise RuntimeError("a job without a slot was assigned")
         source = job.slot.memory[: job.size_bytes]
@@ -285,6 +315,10 @@ class WorkerPool:
 
     def _copy_out(self, job: Job) -> None:
         if job.answer.done() or job.slot is None:
+            self._finish(job)
+            return
+        if job.shared is not None:
+            job.answer.set_result(job.shared.target)
             self._finish(job)
             return
         drawn = job.slot.memory[job.size_bytes : 2 * job.size_bytes]
@@ -310,6 +344,10 @@ class WorkerPool:
         if job.slot is not None:
             self._slots.release(job.slot)
         job.slot = None
+        if job.region is not None:
+            self._regions.leave(job.region)
+        job.region = None
+        job.released.set()
         self._jobs.discard(job)
         if not self._jobs:
             self._done_all.set()

@@ -80,6 +80,11 @@ class SlotPool:
         self.size_bytes = 0
         self.closed = False
 
+    def next_number(self) -> int:
+        """A number that no slot has or will have."""
+        self._made += 1
+        return self._made
+
     @property
     def used(self) -> int:
         """Slots that are in use."""
@@ -106,9 +111,8 @@ class SlotPool:
                 self._drop(self._free.popitem(last=False)[1])
             if self.size_bytes + wanted > self._limit_bytes:
                 return None
-            self._made += 1
             try:
-                fitting = Slot.create(self._made, wanted)
+                fitting = Slot.create(self.next_number(), wanted)
             except OSError as error:
                 raise RendererUnavailable(
                     f"The system gives no shared memory: {error.strerror}.", setting="shared_memory_bytes"

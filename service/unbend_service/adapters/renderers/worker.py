@@ -15,9 +15,19 @@ import time
 
 import numpy as np
 
-from unbend_service.adapters.renderers.channel import Begin, Channel, Done, Failed, MapSlot, Ready, Task, UnmapSlots
+from unbend_service.adapters.renderers.channel import (
+    Begin,
+    Channel,
+    Done,
+    Failed,
+    MapSlot,
+    Place,
+    Ready,
+    Task,
+    UnmapSlots,
+)
 from unbend_service.adapters.renderers.slots import Slot
-from unbend_service.application.ports import Renderer
+from unbend_service.application.ports import Bytes, Renderer
 from unbend_service.domain.errors import InvalidInput, RendererUnavailable, RenderFailed, UnbendError
 from unbend_service.domain.frames import Frame, frame_size_bytes
 from unbend_service.domain.grid import Grid
@@ -63,18 +73,20 @@ class Worker:
         return Done(task.number, time.perf_counter() - started)
 
     def _render(self, task: Task) -> None:
-        memory = self._slots[task.slot].memory
         for grid_id in task.forget:
             self._grids.pop(grid_id, None)
         if task.lattice is not None:
             rows, columns = task.lattice
-            lattice = memory[task.lattice_offset : task.lattice_offset + rows * columns * 8]
+            lattice = self._part(task.lattice_place, rows * columns * 8)
             self._grids[task.grid_id] = Grid(lattice.view(np.float32).reshape(rows, columns, 2))
         size_bytes = frame_size_bytes(task.pixel_format, task.width, task.height)
-        source = memory[:size_bytes]
+        source, target = self._part(task.source, size_bytes), self._part(task.target, size_bytes)
         source.flags.writeable = False
         frame = Frame(task.pixel_format, task.width, task.height, source)
-        self._renderer.render(frame, self._grids[task.grid_id], task.border, memory[size_bytes : 2 * size_bytes])
+        self._renderer.render(frame, self._grids[task.grid_id], task.border, target)
+
+    def _part(self, place: Place, size_bytes: int) -> Bytes:
+        return self._slots[place.slot].memory[place.offset : place.offset + size_bytes]
 
 
 def _as_unbend_error(error: Exception) -> UnbendError:

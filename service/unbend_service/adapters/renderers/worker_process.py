@@ -11,7 +11,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from unbend_service.adapters.renderers.channel import Begin, Channel, FromWorker, MapSlot, Task, UnmapSlots
+from unbend_service.adapters.renderers.channel import Begin, Channel, FromWorker, MapSlot, Place, Task, UnmapSlots
 from unbend_service.adapters.renderers.jobs import Job
 from unbend_service.adapters.renderers.selection import RendererOptions
 from unbend_service.application.ports import RendererInfo
@@ -73,9 +73,10 @@ class WorkerProcess:
         slot = job.slot
         if slot is None:
             raise RuntimeError("a job without a slot was sent")
-        if slot.number not in self._mapped:
-            self.channel.send(MapSlot(slot.number, slot.size_bytes), slot.fd)
-            self._mapped.add(slot.number)
+        for memory in (slot, job.region):
+            if memory is not None and memory.number not in self._mapped:
+                self.channel.send(MapSlot(memory.number, memory.size_bytes), memory.fd)
+                self._mapped.add(memory.number)
         known = job.grid.id in self._grids
         self._grids[job.grid.id] = job.grid.source.nbytes
         self._grids.move_to_end(job.grid.id)
@@ -86,17 +87,19 @@ class WorkerProcess:
             lattice = job.grid.source.reshape(-1).view(np.uint8)
             slot.memory[job.lattice_offset : job.lattice_offset + lattice.size] = lattice
         frame = job.frame
+        source, target = job.places()
         self.channel.send(
             Task(
                 number=job.number,
-                slot=slot.number,
+                source=source,
+                target=target,
                 pixel_format=frame.pixel_format,
                 width=frame.width,
                 height=frame.height,
                 border=job.border,
                 grid_id=job.grid.id,
                 lattice=None if known else (job.grid.rows, job.grid.columns),
-                lattice_offset=job.lattice_offset,
+                lattice_place=Place(slot.number, job.lattice_offset),
                 forget=tuple(forget),
             )
         )

@@ -157,15 +157,20 @@ def from_record(record: GridRecord, *, whole: bool) -> grid_pb2.GridRecord:
     )
 
 
-def fill_result(message: correction_pb2.StreamResult, result: StreamResult) -> None:
-    """Writes a result into an empty message; one that is put into another message later is copied once more."""
-    message.index = result.index
-    message.timestamp_us = result.timestamp_us
-    message.status = FRAME_STATUSES[result.status]
-    message.data = result.data
+def from_result(result: StreamResult) -> correction_pb2.StreamResult:
+    """The message of a result, without its data."""
+    message = correction_pb2.StreamResult(
+        index=result.index, timestamp_us=result.timestamp_us, status=FRAME_STATUSES[result.status]
+    )
     if result.error is not None:
         message.error.code = result.error.code
         message.error.message = str(result.error)
+    if result.shared is not None:
+        message.shared.region_id = result.shared.region_id
+        message.shared.source_offset = result.shared.source_offset
+        message.shared.target_offset = result.shared.target_offset
+        message.shared.size_bytes = result.shared.size_bytes
+    return message
 
 
 def _to_family(guides: list[grid_pb2.Guide]) -> GuideFamily:

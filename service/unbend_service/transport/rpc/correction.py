@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from dataclasses import replace
 
+import grpc
+
+from unbend._wire import FRAME_DATA_FIELD, FRAME_FIELD, RESULT_DATA_FIELD, RESULT_FIELD, attach, detach
 from unbend.v1 import correction_pb2, correction_pb2_grpc, frame_pb2
 from unbend_service.application.correction import Correction
 from unbend_service.application.stream_messages import (
@@ -14,6 +17,7 @@ from unbend_service.application.stream_messages import (
     GridFixed,
     GridSource,
     RawFormat,
+    SharedPlaces,
     StoredGrid,
     StreamConfig,
     StreamEvent,
@@ -26,8 +30,8 @@ from unbend_service.settings import Settings
 from unbend_service.transport.rpc.calls import Context
 from unbend_service.transport.rpc.convert import (
     ENCODED_FORMATS,
-    fill_result,
     from_record,
+    from_result,
     to_delivery,
     to_format,
     to_frame,
@@ -39,6 +43,7 @@ from unbend_service.transport.rpc.pictures import check_body, check_pixels
 
 Request = correction_pb2.CorrectStreamRequest
 Response = correction_pb2.CorrectStreamResponse
+SERVICE = correction_pb2.DESCRIPTOR.services_by_name["CorrectionService"].full_name
 
 
 class CorrectionServicer(correction_pb2_grpc.CorrectionServiceServicer):
@@ -81,7 +86,7 @@ class CorrectionServicer(correction_pb2_grpc.CorrectionServiceServicer):
         )
 
     async def CorrectStream(  # type: ignore[override] # noqa: N802 writes instead of yielding: a write can be ended
-        self, requests: AsyncIterator[Request], context: Context
+        self, requests: AsyncIterator[Request | StreamFrame], context: Context
     ) -> None:
         config = await self._opening(requests)
         async with self._streams.open(config) as session:
@@ -90,11 +95,11 @@ class CorrectionServicer(correction_pb2_grpc.CorrectionServiceServicer):
             )
             await context.write(Response(opened=opened))
             async for event in session.run(_frames(requests)):
-                await context.write(_response(event))
+                await context.write(event)
 
-    async def _opening(self, requests: AsyncIterator[Request]) -> StreamConfig:
+    async def _opening(self, requests: AsyncIterator[Request | StreamFrame]) -> StreamConfig:
         async for request in requests:
-            if request.WhichOneof("message") != "open":
+            if isinstance(request, StreamFrame) or request.WhichOneof("message") != "open":
                 break
             return to_config(request.open)
         raise ProtocolViolation("A stream begins with its open message.", allowed="open, then frames")
@@ -127,17 +132,53 @@ def _grid_source(message: correction_pb2.StreamOpen) -> GridSource:
             return EstimateOver(message.estimate.frames or None)
 
 
-async def _frames(requests: AsyncIterator[Request]) -> AsyncIterator[StreamFrame]:
+async def _frames(requests: AsyncIterator[Request | StreamFrame]) -> AsyncIterator[StreamFrame]:
     async for request in requests:
-        if request.WhichOneof("message") != "frame":
+        if not isinstance(request, StreamFrame):
             raise ProtocolViolation("A stream is opened once.", allowed="open, then frames")
-        frame = request.frame
-        yield StreamFrame(frame.index, frame.timestamp_us, frame.data)
+        yield request
 
 
-def _response(event: StreamEvent) -> Response:
+def read_request(body: bytes) -> Request | StreamFrame:
+    """A message of a stream; the picture of a frame is shown where it lies in ``body``."""
+    if (parts := detach(body, FRAME_FIELD, FRAME_DATA_FIELD)) is not None:
+        return _to_stream_frame(correction_pb2.StreamFrame.FromString(parts[0]), parts[1])
+    request = Request.FromString(body)
+    if request.WhichOneof("message") == "frame":
+        return _to_stream_frame(request.frame, request.frame.data)
+    return request
+
+
+def _to_stream_frame(message: correction_pb2.StreamFrame, data: bytes | memoryview) -> StreamFrame:
+    shared = message.shared
+    places = (
+        SharedPlaces(shared.region_id, shared.source_offset, shared.target_offset, shared.size_bytes)
+        if message.HasField("shared")
+        else None
+    )
+    return StreamFrame(message.index, message.timestamp_us, data, places)
+
+
+def write_response(event: Response | StreamEvent) -> bytes:
+    """A message of a stream; the picture of a result is copied once."""
+    if isinstance(event, Response):
+        return event.SerializeToString()
     if isinstance(event, GridFixed):
-        return Response(grid=correction_pb2.StreamGrid(record=from_record(event.record, whole=False)))
-    response = Response()
-    fill_result(response.result, event)
-    return response
+        grid = correction_pb2.StreamGrid(record=from_record(event.record, whole=False))
+        return Response(grid=grid).SerializeToString()
+    return attach(RESULT_FIELD, from_result(event).SerializeToString(), RESULT_DATA_FIELD, event.data)
+
+
+def add_to_server(servicer: CorrectionServicer, server: grpc.aio.Server) -> None:
+    """As the generated function does, but the pictures of streams do not go through protobuf, which copies them."""
+    handlers = {
+        "Correct": grpc.unary_unary_rpc_method_handler(
+            servicer.Correct,
+            request_deserializer=correction_pb2.CorrectRequest.FromString,
+            response_serializer=correction_pb2.CorrectResponse.SerializeToString,
+        ),
+        "CorrectStream": grpc.stream_stream_rpc_method_handler(
+            servicer.CorrectStream, request_deserializer=read_request, response_serializer=write_response
+        ),
+    }
+    server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE, handlers),))

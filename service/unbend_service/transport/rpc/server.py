@@ -6,18 +6,18 @@ import grpc
 from grpc_health.v1 import health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
-from unbend.v1 import correction_pb2, correction_pb2_grpc, estimation_pb2, estimation_pb2_grpc, grid_pb2, grid_pb2_grpc
+from unbend.v1 import estimation_pb2, estimation_pb2_grpc, grid_pb2, grid_pb2_grpc
 from unbend_service.application.service import Service
 from unbend_service.settings import Settings
 from unbend_service.transport.rpc.calls import CallInterceptor
-from unbend_service.transport.rpc.correction import CorrectionServicer
+from unbend_service.transport.rpc.correction import SERVICE, CorrectionServicer, add_to_server
 from unbend_service.transport.rpc.estimation import EstimationServicer
 from unbend_service.transport.rpc.grids import GridServicer
 from unbend_service.transport.rpc.health import HealthServicer
 
 _SERVICES = (
     estimation_pb2.DESCRIPTOR.services_by_name["EstimationService"].full_name,
-    correction_pb2.DESCRIPTOR.services_by_name["CorrectionService"].full_name,
+    SERVICE,
     grid_pb2.DESCRIPTOR.services_by_name["GridService"].full_name,
 )
 _HEALTH = "grpc.health.v1.Health"
@@ -58,9 +58,7 @@ def create_server(service: Service, settings: Settings) -> grpc.aio.Server:
     estimation_pb2_grpc.add_EstimationServiceServicer_to_server(
         EstimationServicer(service.estimation, settings), server
     )
-    correction_pb2_grpc.add_CorrectionServiceServicer_to_server(
-        CorrectionServicer(service.correction, service.streams, settings), server
-    )
+    add_to_server(CorrectionServicer(service.correction, service.streams, settings), server)
     grid_pb2_grpc.add_GridServiceServicer_to_server(GridServicer(service.grids), server)
     health_pb2_grpc.add_HealthServicer_to_server(HealthServicer(service, _SERVICES), server)
     reflection.enable_server_reflection((*_SERVICES, _HEALTH, reflection.SERVICE_NAME), server)

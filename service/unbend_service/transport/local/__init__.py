@@ -1,0 +1,1 @@
+"""Clients of the same host: the socket over which they share memory."""

@@ -1,0 +1,90 @@
+"""A real service and clients of the same host that share memory with it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import unbend
+from tests.acceptance.conftest import Server, start_server, stop_server
+
+WIDTH, HEIGHT = 640, 360
+SHAPE = (HEIGHT * 3 // 2, WIDTH)
+ENDLESS = f"""
+import itertools, sys, numpy as np, unbend
+with unbend.Client(sys.argv[1], shared_memory=sys.argv[2]) as client:
+    with client.stream({WIDTH}, {HEIGHT}, "i420") as stream:
+        frame = np.zeros({SHAPE}, np.uint8)
+        for result in stream.correct(itertools.repeat(frame)):
+            if result.index == 20:
+                print("going", flush=True)
+"""
+
+
+@pytest.fixture(scope="module")
+def local(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Server, Path]]:
+    path = tmp_path_factory.mktemp("local") / "frames.sock"
+    server = start_server(local_socket=str(path), renderer="cpu", workers="2")
+    yield server, path
+    assert stop_server(server) == 0
+    assert not path.exists()
+
+
+def shared_memories(server: Server) -> int:
+    """Descriptors and mappings of clients' memory, over all processes of the service."""
+    count = 0
+    for pid in (server.process.pid, *(worker.pid for worker in server.workers())):
+        links = [os.readlink(entry) for entry in Path(f"/proc/{pid}/fd").iterdir() if entry.is_symlink()]
+        maps = Path(f"/proc/{pid}/maps").read_text().splitlines()
+        count += sum("unbend-frames" in line for line in (*links, *maps))
+    return count
+
+
+def until_none(server: Server) -> None:
+    end = time.monotonic() + 10
+    while count := shared_memories(server):
+        assert time.monotonic() < end, f"{count} are left"
+        time.sleep(0.05)
+
+
+def test_frames_through_shared_memory_are_those_of_the_connection(local: tuple[Server, Path]) -> None:
+    server, path = local
+    frames = [np.random.default_rng(seed).integers(0, 255, SHAPE, np.uint8) for seed in range(6)]
+    points = np.linspace(-0.95, 0.95, 17)
+    lens = np.stack(np.meshgrid(points, points), axis=-1) * (
+        1 - 0.1 * np.hypot(*np.meshgrid(points, points))[..., None]
+    )
+    with unbend.Client(server.grpc) as plain, unbend.Client(server.grpc, shared_memory=path) as sharing:
+        record = plain.grids.put(unbend.Grid(lens))
+        images = []
+        for client in (plain, sharing):
+            with client.stream(WIDTH, HEIGHT, "i420", grid=record) as stream:
+                images.append([result.image for result in stream.correct(frames)])
+    for one, other in zip(*images, strict=True):
+        np.testing.assert_array_equal(one, other)
+    until_none(server)
+
+
+def test_of_a_client_that_is_killed_nothing_is_left(local: tuple[Server, Path]) -> None:
+    """No descriptor, no mapping, nothing in /dev/shm; the service goes on."""
+    server, path = local
+    before = set(os.listdir("/dev/shm"))
+    with subprocess.Popen(
+        [sys.executable, "-c", ENDLESS, server.grpc, str(path)], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "going\n"
+        assert shared_memories(server)
+        process.send_signal(signal.SIGKILL)
+    until_none(server)
+    assert set(os.listdir("/dev/shm")) <= before
+    with unbend.Client(server.grpc, shared_memory=path) as client, client.stream(WIDTH, HEIGHT, "i420") as stream:
+        assert len(list(stream.correct([np.zeros(SHAPE, np.uint8)] * 10))) == 10
