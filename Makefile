@@ -17,7 +17,7 @@ $(VENV)/.service: pyproject.toml $(CONSTRAINTS) | $(BIN)/python
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml $(CONSTRAINTS) | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS) -e '.[service,video,export,lensfun]' --group dev
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS) -e '.[service,redis,video,export,lensfun]' --group dev
 	@touch $@ $(VENV)/.service
 
 $(VENV)/.e2e: pyproject.toml $(CONSTRAINTS) $(VENV)/.dev

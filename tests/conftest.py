@@ -7,6 +7,9 @@ import pytest
 import structlog
 from hypothesis import settings
 
+from benchmarks.companions import Companion, redis_server
+from tests.companions import started
+
 # The time of an example is no property of the code on a shared machine, and a failure must come back on the next run.
 settings.register_profile("unbend", deadline=None, derandomize=True, max_examples=40)
 settings.load_profile("unbend")
@@ -21,3 +24,11 @@ def logs_as_they_were() -> Iterator[None]:
     structlog.reset_defaults()
     root.handlers[:] = handlers
     root.setLevel(level)
+
+
+@pytest.fixture(scope="session")
+def redis(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Companion]:
+    """A real redis-server for every test that neither pauses nor stops it; tests keep apart by their prefixes."""
+    running = started(lambda: redis_server(tmp_path_factory.mktemp("redis")))
+    yield running
+    running.stop()

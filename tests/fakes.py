@@ -137,6 +137,8 @@ class RecordingMeter:
         self.rejections: Counter[str] = Counter()
         self.restarts: Counter[str] = Counter()
         self.cache: Counter[bool] = Counter()
+        self.store: Counter[tuple[str, str]] = Counter()
+        self.store_up: list[bool] = []
         self.streams_open = 0
         self.pools: list[PoolState] = []
         self.models: list[ModelInfo] = []
@@ -167,6 +169,12 @@ class RecordingMeter:
 
     def grid_cache(self, hit: bool) -> None:
         self.cache[hit] += 1
+
+    def grid_store(self, operation: str, result: str) -> None:
+        self.store[operation, result] += 1
+
+    def grid_store_up(self, up: bool) -> None:
+        self.store_up.append(up)
 
     def pool(self, state: PoolState) -> None:
         self.pools.append(state)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, SecretStr
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 
@@ -88,10 +88,34 @@ class Settings(BaseSettings):
         160 << 20, ge=1 << 20, description="Largest gRPC message; a raw 7680x4320 rgba frame takes 127 MiB."
     )
 
-    grid_store: Literal["memory", "sqlite"] = Field("memory", description="Where grids are kept.")
+    grid_store: Literal["memory", "sqlite", "redis"] = Field(
+        "memory", description="Where grids are kept: replicas that take each other's streams share sqlite or redis."
+    )
     grid_store_path: Path = Field(Path("unbend-grids.sqlite3"), description="File of the sqlite grid store.")
     grid_store_entries: int = Field(10_000, ge=1, description="Most grids that are kept; the oldest goes first.")
     grid_store_ttl_s: float = Field(30 * 86_400.0, gt=0, description="Seconds after its last use that a grid is kept.")
+    grid_store_local_entries: int = Field(
+        1024, ge=1, description="Grids that a replica keeps itself, for when redis does not answer."
+    )
+    stream_lease_s: float = Field(
+        5.0, gt=0, description="After so long another replica estimates a stream whose replica died over it."
+    )
+
+    redis_url: str = Field(
+        "redis://127.0.0.1:6379/0", description="Redis of the redis grid store: redis://, rediss:// (TLS) or unix://."
+    )
+    redis_username: str | None = Field(None, description="User of redis, if it wants one and the URL names none.")
+    redis_password: SecretStr | None = Field(None, description="Password of redis, if the URL has none.")
+    redis_ca_file: Path | None = Field(None, description="Authorities that may sign redis; unset: the system's.")
+    redis_cert_file: Path | None = Field(None, description="Certificate shown to redis, if it wants one.")
+    redis_key_file: Path | None = Field(None, description="Key of that certificate.")
+    redis_prefix: str = Field(
+        "unbend", pattern=r"^[A-Za-z0-9._-]{1,64}$", description="What the names of all keys in redis begin with."
+    )
+    redis_timeout_s: float = Field(1.0, gt=0, description="Longest wait for redis; then a replica helps itself.")
+    redis_retry_s: float = Field(
+        2.0, gt=0, description="Pause between attempts to reach redis again, during which no call waits for it."
+    )
 
     drain_s: float = Field(20.0, ge=0, description="Grace for accepted work after SIGTERM.")
     log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="Least severe log line.")

@@ -8,6 +8,8 @@ from unbend_service.adapters.drawing.overlay import OverlayIllustrator
 from unbend_service.adapters.estimators.catalogue import load_estimator
 from unbend_service.adapters.exchange.files import ExchangeFiles
 from unbend_service.adapters.grid_stores.memory import MemoryGridStore
+from unbend_service.adapters.grid_stores.redis import RedisGridStore
+from unbend_service.adapters.grid_stores.sheltered import ShelteredGridStore
 from unbend_service.adapters.grid_stores.sqlite import SqliteGridStore
 from unbend_service.adapters.metrics.prometheus import PrometheusMeter
 from unbend_service.adapters.renderers.pool import WorkerPool
@@ -19,17 +21,31 @@ from unbend_service.application.exchange import Exchange
 from unbend_service.application.fitting import FittedGrids
 from unbend_service.application.grids import GridLibrary
 from unbend_service.application.illustration import Illustration
-from unbend_service.application.ports import GridStore
 from unbend_service.application.regions import Regions
+from unbend_service.application.ports import GridStore, Meter
 from unbend_service.application.service import Service
 from unbend_service.application.streams import Streams
 from unbend_service.settings import Settings
 
 
-def build_store(settings: Settings) -> GridStore:
-    """The embedded grid store that the settings name."""
+def build_store(settings: Settings, meter: Meter | None = None) -> GridStore:
+    """The grid store that the settings name.
+
+    Raises:
+        InvalidOption, GridStoreUnavailable: it cannot be had.
+    """
     if settings.grid_store == "sqlite":
         return SqliteGridStore(settings)
+    if settings.grid_store == "redis":
+        meter = meter or PrometheusMeter()
+        kept = settings.grid_store_local_entries
+        return ShelteredGridStore(
+            RedisGridStore(settings, meter),
+            MemoryGridStore(settings, entries=kept),
+            meter,
+            retry_s=settings.redis_retry_s,
+            owed_entries=kept,
+        )
     return MemoryGridStore(settings)
 
 
@@ -49,7 +65,7 @@ def build_service(settings: Settings, meter: PrometheusMeter | None = None) -> S
     meter = meter or PrometheusMeter()
     blocking = BlockingWork(usable_cores(), settings.queue_frames, meter)
     codec = PillowCodec(settings)
-    store = build_store(settings)
+    store = build_store(settings, meter)
     fitted_grids = FittedGrids(blocking, meter)
     pool = WorkerPool(settings, meter)
     estimator = load_estimator(settings.model, settings.estimator_threads or usable_cores())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import random
+from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, field
 
@@ -218,6 +219,47 @@ async def test_a_resumed_stream_has_the_same_grid_without_a_second_estimate(buil
     assert grids(before)[0].id == grids(after)[0].id
     assert replica.meter.estimates == {}
     assert replica.estimator.seen == []
+
+
+async def test_a_stream_that_is_opened_on_two_replicas_at_once_is_estimated_once(build: Build) -> None:
+    """Whichever replica was first estimates; the other waits for its grid, and answers every frame with it."""
+    store = MemoryGridStore(Settings())
+    replicas = [build(store) for _ in range(3)]
+    config = StreamConfig(SMALL, stream_id="camera-7")
+
+    answers = await asyncio.gather(*(replica.collect(config, frames(30)) for replica in replicas))
+
+    assert sum((replica.meter.estimates for replica in replicas), Counter()) == {"corrected": 1}
+    assert len({grids(events)[0].id for events in answers}) == 1
+    assert [statuses(events) for events in answers] == [["corrected"] * 30] * 3
+
+
+async def test_a_replica_that_died_over_an_estimate_keeps_the_stream_no_longer_than_its_lease(build: Build) -> None:
+    """The claim of a dead replica lapses, and the stream is estimated where it is now."""
+    store = MemoryGridStore(Settings())
+    assert await store.claim_stream("camera-7", "the dead one's", 0.3)
+    bench = build(store)
+
+    start = asyncio.get_running_loop().time()
+    events = await bench.collect(StreamConfig(SMALL, stream_id="camera-7"), frames(10))
+
+    assert statuses(events) == ["corrected"] * 10
+    assert bench.meter.estimates == {"corrected": 1}
+    assert 0.25 < asyncio.get_running_loop().time() - start < 3
+
+
+async def test_a_session_that_ends_over_an_estimate_gives_its_claim_up(build: Build) -> None:
+    """A client that comes back does not wait for the lease of the session that it left."""
+    store = MemoryGridStore(Settings())
+    bench = build(store, stream_lease_s=60.0)
+    config = StreamConfig(SMALL, stream_id="camera-7")
+    async with bench.streams.open(config) as session:
+        waiting = asyncio.create_task(anext(session.run(frames(2, pause_s=0.2))))
+        await eventually(lambda: bool(bench.estimator.seen))
+        waiting.cancel()
+        await asyncio.gather(waiting, return_exceptions=True)
+
+    assert await store.claim_stream("camera-7", "the next one's", 1.0)
 
 
 async def test_a_stream_may_ask_to_be_estimated_again(build: Build) -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.companions import Companion
 from unbend_service.adapters.estimators.cards import shipped_models
 from unbend_service.cli.diagnosis import graphics, machine, packages, weights
 from unbend_service.cli.diagnosis.finding import Finding
@@ -65,6 +66,14 @@ def test_what_is_broken_is_red_and_ends_the_command_with_one(tmp_path: Path) -> 
     assert "set UNBEND_MODEL" in result.stdout
     assert "set UNBEND_HTTP_PORT" in result.stdout
     assert "set UNBEND_GRID_STORE_PATH" in result.stdout
+
+
+def test_a_redis_that_answers_is_green_and_one_that_does_not_is_red(redis: Companion) -> None:
+    settings = Settings(grid_store="redis", redis_url=f"redis://127.0.0.1:{redis.port}/0")
+    assert machine.examine_grid_store(settings).status == "ok"
+    away = machine.examine_grid_store(settings.model_copy(update={"redis_url": "redis://127.0.0.1:1/0"}))
+    assert away.status == "bad"
+    assert "UNBEND_REDIS_URL" in away.remedy
 
 
 @pytest.fixture

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+import secrets
+from collections.abc import AsyncIterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.fakes import barrel_guides
+from tests.fakes import RecordingMeter, barrel_guides
 from unbend_service.adapters.grid_stores.memory import MemoryGridStore
+from unbend_service.adapters.grid_stores.redis import RedisGridStore
+from unbend_service.adapters.grid_stores.sheltered import ShelteredGridStore
 from unbend_service.adapters.grid_stores.sqlite import SqliteGridStore
 from unbend_service.application.ports import GridStore
 from unbend_service.domain.errors import GridNotFound
@@ -32,20 +35,35 @@ class Clock:
         return self.now
 
 
-Build = Callable[[Settings, Clock], GridStore]
-
-
 @pytest.fixture
 def clock() -> Clock:
     return Clock()
 
 
-@pytest.fixture(params=[MemoryGridStore, SqliteGridStore], ids=["memory", "sqlite"])
-async def store(request: pytest.FixtureRequest, tmp_path: Path, clock: Clock):
+def built(kind: str, settings: Settings, clock: Clock) -> GridStore:
+    match kind:
+        case "memory":
+            return MemoryGridStore(settings, clock)
+        case "sqlite":
+            return SqliteGridStore(settings, clock)
+    shared = RedisGridStore(settings, RecordingMeter(), clock)
+    if kind == "redis":
+        return shared
+    return ShelteredGridStore(
+        shared, MemoryGridStore(settings, clock), RecordingMeter(), retry_s=1.0, owed_entries=ENTRIES
+    )
+
+
+@pytest.fixture(params=["memory", "sqlite", "redis", "sheltered"])
+async def store(request: pytest.FixtureRequest, tmp_path: Path, clock: Clock) -> AsyncIterator[GridStore]:
     settings = Settings(grid_store_entries=ENTRIES, grid_store_ttl_s=TTL_S, grid_store_path=tmp_path / "grids.sqlite3")
-    built: GridStore = request.param(settings, clock)
-    yield built
-    await built.close()
+    if request.param in ("redis", "sheltered"):
+        port = request.getfixturevalue("redis").port
+        chosen = {"redis_url": f"redis://127.0.0.1:{port}/0", "redis_prefix": f"t{secrets.token_hex(6)}"}
+        settings = settings.model_copy(update=chosen)
+    made = built(request.param, settings, clock)
+    yield made
+    await made.close()
 
 
 def record(bend: float = 0.06) -> GridRecord:
@@ -176,3 +194,45 @@ async def test_concurrent_use_is_safe(store: GridStore) -> None:
     await asyncio.gather(*(store.put(each) for each in records * 5))
     found = await asyncio.gather(*(store.get(each.id) for each in records * 20))
     assert [each.id for each in found] == [each.id for each in records * 20]
+
+
+async def test_the_first_grid_of_a_stream_wins_unless_it_is_replaced(store: GridStore) -> None:
+    """Two estimates of one stream end in one grid: the later one learns of the earlier."""
+    first, second = record(0.01), record(0.02)
+    await store.put(first)
+    await store.put(second)
+    assert await store.bind_stream("camera-7", first.id, replace=False) == first.id
+    assert await store.bind_stream("camera-7", second.id, replace=False) == first.id
+    assert await store.stream_grid("camera-7") == first.id
+    assert await store.bind_stream("camera-7", second.id) == second.id
+    await store.delete(second.id)
+    assert await store.bind_stream("camera-7", first.id, replace=False) == first.id
+
+
+async def test_one_of_many_may_estimate_a_stream(store: GridStore) -> None:
+    """A claim is one token's until it is given back; another stream is another claim."""
+    taken = await asyncio.gather(*(store.claim_stream("camera-7", f"token-{i}", 30.0) for i in range(8)))
+    assert taken.count(True) == 1
+    holder = f"token-{taken.index(True)}"
+    assert await store.claim_stream("camera-7", holder, 30.0)
+    assert await store.claim_stream("camera-8", "other", 30.0)
+    await store.release_stream("camera-7", "other")
+    assert not await store.claim_stream("camera-7", "other", 30.0)
+    await store.release_stream("camera-7", holder)
+    assert await store.claim_stream("camera-7", "other", 30.0)
+
+
+async def test_a_claim_lapses_unless_it_is_renewed(store: GridStore, clock: Clock) -> None:
+    """A replica that dies over an estimate keeps nobody from it for longer than its lease."""
+
+    async def pass_by(seconds: float) -> None:
+        clock.now += seconds
+        await asyncio.sleep(seconds)  # redis counts by its own clock
+
+    assert await store.claim_stream("camera-7", "dead", 0.3)
+    await pass_by(0.2)
+    assert await store.claim_stream("camera-7", "dead", 0.3)
+    await pass_by(0.2)
+    assert not await store.claim_stream("camera-7", "heir", 0.3)
+    await pass_by(0.2)
+    assert await store.claim_stream("camera-7", "heir", 0.3)

@@ -228,12 +228,26 @@ class GridStore(Protocol):
         """Raises GridNotFound."""
         ...
 
-    async def bind_stream(self, stream_id: str, grid_id: str) -> None:
-        """Remembers the grid of a stream, so that a resumed stream gets the same one without a new estimate."""
+    async def bind_stream(self, stream_id: str, grid_id: str, *, replace: bool = True) -> str:
+        """Remembers the grid of a stream, so that a resumed stream gets the same one without a new estimate.
+
+        Returns the grid id that is bound now: without ``replace`` the one that was, while its grid is kept.
+        """
         ...
 
     async def stream_grid(self, stream_id: str) -> str | None:
         """The grid id that was bound, None if there is none (any more)."""
+        ...
+
+    async def claim_stream(self, stream_id: str, token: str, lease_s: float) -> bool:
+        """Whether the grid of a stream is ``token``'s to estimate; nobody else's for the next ``lease_s`` seconds.
+
+        Asked again with the same token, the lease begins anew. A holder that dies loses it by time.
+        """
+        ...
+
+    async def release_stream(self, stream_id: str, token: str) -> None:
+        """Gives a claim up; without effect if it is not ``token``'s."""
         ...
 
     async def close(self) -> None: ...
@@ -380,6 +394,14 @@ class Meter(Protocol):
     def worker_restarted(self, reason: str) -> None: ...
 
     def grid_cache(self, hit: bool) -> None: ...
+
+    def grid_store(self, operation: str, result: str) -> None:
+        """One call of a shared grid store; ``result`` is shared, local (the replica helped itself) or unreadable."""
+        ...
+
+    def grid_store_up(self, up: bool) -> None:
+        """Whether the shared grid store answers, when that changes."""
+        ...
 
     def pool(self, state: PoolState) -> None: ...
 

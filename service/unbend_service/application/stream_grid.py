@@ -10,10 +10,10 @@ from unbend_service.application.correction import Correction, leaves_alone
 from unbend_service.application.estimation import ESTIMATE_LONGEST_PX, Estimation, fused_estimate
 from unbend_service.application.grey import grey_of_frame
 from unbend_service.application.ports import Bytes, Estimate, GridStore
+from unbend_service.application.stream_lead import StreamLead
 from unbend_service.application.stream_messages import DrawnGuides, EstimateOver, StoredGrid, StreamConfig
 from unbend_service.application.turns import Turns
 from unbend_service.domain.decision import spin_grid
-from unbend_service.domain.errors import GridNotFound
 from unbend_service.domain.frames import Frame
 from unbend_service.domain.grid import Grid
 from unbend_service.domain.records import Correct, GridRecord
@@ -71,12 +71,15 @@ class StreamGrid:
         self._estimates: list[Estimate] = []
         self._tasks: set[asyncio.Task[None]] = set()
         self._timer: asyncio.TimerHandle | None = None
+        self._may_be_known = bool(config.stream_id) and not config.estimate_again
+        self._lead = StreamLead(store, stream_id, settings.stream_lease_s)
+        self._winning: asyncio.Task[GridRecord | None] | None = None
 
     async def prepare(self) -> bool:
         """Fixes the grid if that takes no frame; returns whether the stream id was known and its grid is reused."""
         source, bound = self._config.grid_source, None
-        if self._config.stream_id and not self._config.estimate_again:
-            bound = await self._bound_record()
+        if self._may_be_known:
+            bound = await self._lead.bound_record()
         if isinstance(source, EstimateOver):
             self._wanted = source.frames or self._settings.stream_estimate_frames
             if bound is not None:
@@ -139,9 +142,11 @@ class StreamGrid:
         """Ends what is under way."""
         if self._timer is not None:
             self._timer.cancel()
-        for task in self._tasks:
+        tasks = [*self._tasks, *filter(None, [self._winning])]
+        for task in tasks:
             task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await asyncio.gather(*tasks, return_exceptions=True)
+        await self._lead.release()
         self._fixed.cancel()
 
     def _rearm(self) -> None:
@@ -175,14 +180,30 @@ class StreamGrid:
             self._settle()
 
     async def _estimate(self, grey: Bytes) -> None:
-        self._estimates.append(await self._turns.run(lambda: self._estimation.of_grey(grey)))
+        if await self._leads():
+            self._estimates.append(await self._turns.run(lambda: self._estimation.of_grey(grey)))
+
+    async def _leads(self) -> bool:
+        """Whether the estimate is to be made here; else the grid of the session that made it is taken over."""
+        if not self._may_be_known:
+            return True
+        if self._winning is None:
+            self._winning = asyncio.create_task(self._lead.win())
+        made = await asyncio.shield(self._winning)
+        if made is None:
+            return True
+        if not self._deciding:
+            self._deciding = True
+            self._fix(await self._fit(made))
+        return False
 
     async def _decide(self) -> None:
         options = self._config.options
         combined = await self._blocking.run("grid", fused_estimate, self._estimates)
         record = await self._estimation.record(combined, options.correct, options.min_confidence)
-        await self._store.bind_stream(self._stream_id, record.id)
-        fixed = await self._fit(record)
+        self._fix(await self._fit(await self._lead.bind(record, replace=not self._may_be_known)))
+
+    def _fix(self, fixed: FixedGrid) -> None:
         if not self._fixed.done():
             self._fixed.set_result(fixed)
 
@@ -190,15 +211,6 @@ class StreamGrid:
         if leaves_alone(record):
             return FixedGrid(record, None)
         return FixedGrid(record, await self._correction.fitted(record, self._config.options))
-
-    async def _bound_record(self) -> GridRecord | None:
-        grid_id = await self._store.stream_grid(self._stream_id)
-        if grid_id is None:
-            return None
-        try:
-            return await self._store.get(grid_id)
-        except GridNotFound:
-            return None
 
     async def _stored(self, source: StoredGrid) -> GridRecord:
         return await self._store.get(source.grid_id)

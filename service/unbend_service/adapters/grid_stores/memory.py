@@ -21,11 +21,17 @@ class MemoryGridStore:
         settings: ``grid_store_entries`` bounds grids and stream bindings each, ``grid_store_ttl_s`` counts from the
             last use.
         clock: seconds that only grow.
+        entries: another bound than the setting.
     """
 
-    def __init__(self, settings: Settings, clock: Callable[[], float] = time.monotonic) -> None:
-        self._grids = _Recent[GridRecord](settings.grid_store_entries, settings.grid_store_ttl_s, clock)
-        self._streams = _Recent[str](settings.grid_store_entries, settings.grid_store_ttl_s, clock)
+    def __init__(
+        self, settings: Settings, clock: Callable[[], float] = time.monotonic, *, entries: int | None = None
+    ) -> None:
+        entries = settings.grid_store_entries if entries is None else entries
+        self._grids = _Recent[GridRecord](entries, settings.grid_store_ttl_s, clock)
+        self._streams = _Recent[str](entries, settings.grid_store_ttl_s, clock)
+        self._claims: dict[str, tuple[str, float]] = {}
+        self._clock = clock
 
     async def put(self, record: GridRecord) -> None:
         self._grids.put(record.id, record)
@@ -42,13 +48,30 @@ class MemoryGridStore:
         await self.get(grid_id)
         self._grids.remove(grid_id)
 
-    async def bind_stream(self, stream_id: str, grid_id: str) -> None:
+    async def bind_stream(self, stream_id: str, grid_id: str, *, replace: bool = True) -> str:
+        """The grid id that is bound now; without ``replace`` the one that was, while its grid is kept."""
+        if not replace and (bound := await self.stream_grid(stream_id)) is not None:
+            return bound
         self._streams.put(stream_id, grid_id)
+        return grid_id
 
     async def stream_grid(self, stream_id: str) -> str | None:
         """The grid id that was bound; None if there is none, or its grid is gone."""
         grid_id = self._streams.get(stream_id)
         return grid_id if grid_id is not None and self._grids.get(grid_id) is not None else None
+
+    async def claim_stream(self, stream_id: str, token: str, lease_s: float) -> bool:
+        """Whether ``token`` holds the claim, for ``lease_s`` seconds from now."""
+        now = self._clock()
+        self._claims = {known: claim for known, claim in self._claims.items() if claim[1] > now}
+        if self._claims.get(stream_id, (token, 0.0))[0] != token:
+            return False
+        self._claims[stream_id] = (token, now + lease_s)
+        return True
+
+    async def release_stream(self, stream_id: str, token: str) -> None:
+        if self._claims.get(stream_id, ("", 0.0))[0] == token:
+            del self._claims[stream_id]
 
     async def close(self) -> None:
         """Nothing is held that could be freed earlier than the store itself."""

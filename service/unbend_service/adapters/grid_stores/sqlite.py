@@ -34,6 +34,11 @@ CREATE INDEX grids_used_at ON grids (used_at);
 CREATE TABLE streams (id TEXT PRIMARY KEY, grid_id TEXT NOT NULL, used_at REAL NOT NULL) WITHOUT ROWID;
 CREATE INDEX streams_used_at ON streams (used_at);
 """
+# Came later; a file of the same version may lack it, and a process that does not know it is not disturbed.
+_CLAIMS = (
+    "CREATE TABLE IF NOT EXISTS claims "
+    "(stream_id TEXT PRIMARY KEY, token TEXT NOT NULL, expires_at REAL NOT NULL) WITHOUT ROWID"
+)
 _TABLES = ("grids", "streams")
 _BUSY_TIMEOUT_S = 5.0
 
@@ -70,12 +75,20 @@ class SqliteGridStore:
         """Raises GridNotFound."""
         await self._run(self._delete, grid_id)
 
-    async def bind_stream(self, stream_id: str, grid_id: str) -> None:
-        await self._run(self._bind_stream, stream_id, grid_id)
+    async def bind_stream(self, stream_id: str, grid_id: str, *, replace: bool = True) -> str:
+        """The grid id that is bound now; without ``replace`` the one that was, while its grid is kept."""
+        return await self._run(self._bind_stream, stream_id, grid_id, replace)
 
     async def stream_grid(self, stream_id: str) -> str | None:
         """The grid id that was bound; None if there is none, or its grid is gone."""
         return await self._run(self._stream_grid, stream_id)
+
+    async def claim_stream(self, stream_id: str, token: str, lease_s: float) -> bool:
+        """Whether ``token`` holds the claim, for ``lease_s`` seconds from now."""
+        return await self._run(self._claim_stream, stream_id, token, lease_s)
+
+    async def release_stream(self, stream_id: str, token: str) -> None:
+        await self._run(self._release_stream, stream_id, token)
 
     async def close(self) -> None:
         await asyncio.get_running_loop().run_in_executor(self._thread, self._connection.close)
@@ -97,6 +110,8 @@ class SqliteGridStore:
                     connection.execute(statement)
                 connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
                 version = SCHEMA_VERSION
+            if version == SCHEMA_VERSION:
+                connection.execute(_CLAIMS)
             connection.execute("COMMIT")
         except sqlite3.Error as error:
             connection.close()
@@ -157,10 +172,13 @@ class SqliteGridStore:
         if not self._connection.execute("DELETE FROM grids WHERE id = ?", (grid_id,)).rowcount:
             raise GridNotFound(f"No grid is stored as {grid_id!r}.")
 
-    def _bind_stream(self, stream_id: str, grid_id: str) -> None:
+    def _bind_stream(self, stream_id: str, grid_id: str, replace: bool) -> str:
+        if not replace and (bound := self._stream_grid(stream_id)) is not None:
+            return bound
         row = (stream_id, grid_id, self._clock())
         self._connection.execute("INSERT OR REPLACE INTO streams VALUES (?, ?, ?)", row)
         self._bound("streams")
+        return grid_id
 
     def _stream_grid(self, stream_id: str) -> str | None:
         now = self._clock()
@@ -171,6 +189,18 @@ class SqliteGridStore:
         grid_id: str = found[0][0]
         kept = self._connection.execute("UPDATE grids SET used_at = ? WHERE id = ?", (now, grid_id)).rowcount
         return grid_id if kept else None
+
+    def _claim_stream(self, stream_id: str, token: str, lease_s: float) -> bool:
+        now = self._clock()
+        self._connection.execute("DELETE FROM claims WHERE expires_at <= ?", (now,))
+        held = self._connection.execute("SELECT token FROM claims WHERE stream_id = ?", (stream_id,)).fetchone()
+        if held is not None and held[0] != token:
+            return False
+        self._connection.execute("INSERT OR REPLACE INTO claims VALUES (?, ?, ?)", (stream_id, token, now + lease_s))
+        return True
+
+    def _release_stream(self, stream_id: str, token: str) -> None:
+        self._connection.execute("DELETE FROM claims WHERE stream_id = ? AND token = ?", (stream_id, token))
 
     def _forget(self) -> None:
         for table in _TABLES:

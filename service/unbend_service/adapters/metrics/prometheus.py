@@ -15,6 +15,7 @@ STAGES = ("queue", "decode", "estimate", "grid", "render", "encode")
 FRAME_RESULTS = ("corrected", "left_alone", "passed_through", "dropped", "failed")
 ESTIMATE_OUTCOMES = ("corrected", "left_alone")
 WORKER_STATES = ("starting", "ready", "busy", "dead")
+GRID_STORE_OPERATIONS = ("put", "get", "delete", "bind", "stream", "claim")
 
 # A frame takes a few ms on a GPU; a large picture some seconds on two cores.
 _STAGE_BUCKETS_S = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
@@ -61,6 +62,18 @@ class PrometheusMeter:
         self._cache = Counter(
             "unbend_grid_cache_requests", "Look-ups of fitted grids: hit or miss.", ["result"], registry=registry
         )
+        self._store = Counter(
+            "unbend_grid_store_operations",
+            "Calls of the shared grid store: answered by it (shared), by the replica itself (local), or unreadable.",
+            ["operation", "result"],
+            registry=registry,
+        )
+        self._store_up = Gauge(
+            "unbend_grid_store_up", "0 while the shared grid store does not answer, else 1.", registry=registry
+        )
+        self._store_outages = Counter(
+            "unbend_grid_store_outages", "Times that the shared grid store stopped answering.", registry=registry
+        )
         self._renderer = Info("unbend_renderer", "Which renderer the workers run.", registry=registry)
         self._model = Info("unbend_model", "Which network estimates.", registry=registry)
         for stage in STAGES:
@@ -73,6 +86,10 @@ class PrometheusMeter:
             self._cache.labels(result)
         for state in WORKER_STATES:
             self._workers.labels(state)
+        for operation in GRID_STORE_OPERATIONS:
+            for result in ("shared", "local"):
+                self._store.labels(operation, result)
+        self._store_up.set(1)
 
     def request(self, transport: str, method: str, code: str, seconds: float) -> None:
         self._requests.labels(transport, method, code).inc()
@@ -101,6 +118,14 @@ class PrometheusMeter:
 
     def grid_cache(self, hit: bool) -> None:
         self._cache.labels("hit" if hit else "miss").inc()
+
+    def grid_store(self, operation: str, result: str) -> None:
+        self._store.labels(operation, result).inc()
+
+    def grid_store_up(self, up: bool) -> None:
+        self._store_up.set(up)
+        if not up:
+            self._store_outages.inc()
 
     def pool(self, state: PoolState) -> None:
         self._queue.set(state.queued)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import mmap
 import os
@@ -17,7 +18,10 @@ import grpc
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from unbend_service.adapters.cores import usable_cores
+from unbend_service.adapters.grid_stores.redis import RedisGridStore
+from unbend_service.adapters.metrics.prometheus import PrometheusMeter
 from unbend_service.cli.diagnosis.finding import Finding
+from unbend_service.domain.errors import UnbendError
 from unbend_service.settings import Settings
 
 _ASK_TIMEOUT_S = 2.0
@@ -78,8 +82,8 @@ def examine_grid_store(settings: Settings) -> Finding:
     """Whether grids can be kept where the settings say."""
     if settings.grid_store == "memory":
         return Finding("grid store", "ok", "memory: grids and stream ids are forgotten when the service ends")
-    if settings.grid_store != "sqlite":
-        return Finding("grid store", "ok", f"{settings.grid_store}: asked when the service starts")
+    if settings.grid_store == "redis":
+        return _examine_redis(settings)
     path = settings.grid_store_path.absolute()
     remedy = "set UNBEND_GRID_STORE_PATH to a file in a folder that this user may write to"
     if path.is_dir():
@@ -103,6 +107,22 @@ def examine_grid_store(settings: Settings) -> Finding:
     if verdict != "ok":
         return Finding("grid store", "bad", f"{path}: {verdict}", "move the file away: a new one will be made")
     return Finding("grid store", "ok", f"sqlite: {path}, {path.stat().st_size >> 10} KiB")
+
+
+def _examine_redis(settings: Settings) -> Finding:
+    async def ask() -> None:
+        store = RedisGridStore(settings, PrometheusMeter())
+        try:
+            await store.ping()
+        finally:
+            await store.close()
+
+    try:
+        asyncio.run(ask())
+    except UnbendError as error:
+        remedy = "see UNBEND_REDIS_URL; until it answers, replicas share no grids"
+        return Finding("grid store", "bad", f"redis: {error.message}", remedy)
+    return Finding("grid store", "ok", f"redis answers; keys begin with {{{settings.redis_prefix}}}")
 
 
 def _port(name: str, setting: str, host: str, port: int, answers: Callable[[str], bool]) -> Finding:

@@ -41,6 +41,7 @@ class Extra:
 
 #: Every extra but ``service``, without which this would not run.
 EXTRAS = {
+    "redis": Extra("redis", "redis", "grids shared by replicas"),
     "video": Extra("av", "av", "unbend video, PyAV frames in the client"),
     "export": Extra("openexr", "OpenEXR", "STMaps as EXR"),
     "lensfun": Extra("lensfunpy", "lensfunpy", "grids from lensfun profiles"),
