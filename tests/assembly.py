@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.fakes import FAKE_MODEL, FakeEstimator, FakeRenderPool, RecordingMeter
+from tests.fakes import FakeEstimator, FakeRenderPool, RecordingMeter
 from unbend_service.adapters.codecs.pillow import PillowCodec
 from unbend_service.adapters.drawing.overlay import OverlayIllustrator
 from unbend_service.adapters.exchange.files import ExchangeFiles
@@ -56,6 +56,6 @@ def service_over_fakes(settings: Settings, store: MemoryGridStore | None = None)
         codec=codec,
         meter=meter,
         blocking=blocking,
-        model=FAKE_MODEL,
+        estimator=estimator,
         bodies=MemoryBudget(settings.bodies_bytes, "bodies_bytes"),
     )

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from unbend._errors import DeadlineExceeded as DeadlineExceeded
     from unbend._errors import Draining as Draining
     from unbend._errors import EmptyBody as EmptyBody
+    from unbend._errors import EstimatorUnavailable as EstimatorUnavailable
     from unbend._errors import FoldedGrid as FoldedGrid
     from unbend._errors import GridConflict as GridConflict
     from unbend._errors import GridNotFound as GridNotFound
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from unbend._errors import MemoryFull as MemoryFull
     from unbend._errors import MissingPackage as MissingPackage
     from unbend._errors import ModelUnavailable as ModelUnavailable
+    from unbend._errors import NotServedHere as NotServedHere
     from unbend._errors import Overloaded as Overloaded
     from unbend._errors import PoisonFrame as PoisonFrame
     from unbend._errors import ProtocolViolation as ProtocolViolation
@@ -83,6 +85,7 @@ _HOMES = {
         "DeadlineExceeded",
         "Draining",
         "EmptyBody",
+        "EstimatorUnavailable",
         "FoldedGrid",
         "GridConflict",
         "GridNotFound",
@@ -98,6 +101,7 @@ _HOMES = {
         "InvalidRegion",
         "MissingPackage",
         "ModelUnavailable",
+        "NotServedHere",
         "Overloaded",
         "PoisonFrame",
         "ProtocolViolation",

@@ -21,6 +21,7 @@ The tree; what stands in brackets is the builtin that the error also is::
     ├── GridNotFound [LookupError]
     ├── RegionNotFound [LookupError]
     ├── GridConflict
+    ├── NotServedHere
     ├── Overloaded
     │   ├── QueueFull
     │   ├── MemoryFull
@@ -28,6 +29,7 @@ The tree; what stands in brackets is the builtin that the error also is::
     │   └── TooManyStreams
     ├── Unavailable [ConnectionError]
     │   ├── Draining
+    │   ├── EstimatorUnavailable
     │   ├── GridStoreUnavailable
     │   ├── ModelUnavailable
     │   ├── RendererUnavailable
@@ -195,6 +197,12 @@ class GridConflict(UnbendError):
     code = "grid_conflict"
 
 
+class NotServedHere(UnbendError):
+    """The role of this server leaves this kind of work to others."""
+
+    code = "not_served_here"
+
+
 class Overloaded(UnbendError):
     """The server is at one of its limits; trying later may help."""
 
@@ -235,6 +243,12 @@ class Draining(Unavailable):
     """The server is shutting down and accepts nothing new."""
 
     code = "draining"
+
+
+class EstimatorUnavailable(Unavailable):
+    """The estimation node that a render node asks does not answer."""
+
+    code = "estimator_unavailable"
 
 
 class GridStoreUnavailable(Unavailable):

@@ -88,6 +88,7 @@ async def serve(settings: Settings, on_ready: Callable[[Addresses], None] | None
             hardware=renderer.hardware if renderer else None,
             workers=len(pool.workers),
             model=service.model.name,
+            role=service.role,
         )
         if on_ready is not None:
             on_ready(addresses)

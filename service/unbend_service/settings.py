@@ -14,6 +14,14 @@ class Settings(BaseSettings):
 
     model_config = SettingsConfigDict(env_prefix="UNBEND_", extra="ignore")
 
+    role: Literal["all", "estimate", "render"] = Field(
+        "all", description="What this node does; render asks a node that estimates, estimate refuses to render."
+    )
+    estimator_address: str | None = Field(
+        None, description="With the role render: gRPC address of the estimation nodes, host:port or dns:///host:port."
+    )
+    estimator_timeout_s: float = Field(10.0, gt=0, description="Longest wait for an estimation node.")
+
     http_host: str = Field("127.0.0.1", description="Address that HTTP listens on.")
     http_port: int = Field(8080, ge=0, le=65535, description="Port of HTTP; 0 takes a free one.")
     grpc_host: str = Field("127.0.0.1", description="Address that gRPC listens on.")

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from unbend_service.adapters.codecs.pillow import PillowCodec
 from unbend_service.adapters.cores import usable_cores
 from unbend_service.adapters.drawing.overlay import OverlayIllustrator
 from unbend_service.adapters.estimators.catalogue import load_estimator
+from unbend_service.adapters.estimators.remote import RemoteEstimator
 from unbend_service.adapters.exchange.files import ExchangeFiles
 from unbend_service.adapters.grid_stores.memory import MemoryGridStore
 from unbend_service.adapters.grid_stores.redis import RedisGridStore
 from unbend_service.adapters.grid_stores.sheltered import ShelteredGridStore
 from unbend_service.adapters.grid_stores.sqlite import SqliteGridStore
 from unbend_service.adapters.metrics.prometheus import PrometheusMeter
+from unbend_service.adapters.renderers.absent import AbsentPool
 from unbend_service.adapters.renderers.pool import WorkerPool
 from unbend_service.application.blocking import BlockingWork
 from unbend_service.application.budget import MemoryBudget
@@ -21,11 +25,15 @@ from unbend_service.application.exchange import Exchange
 from unbend_service.application.fitting import FittedGrids
 from unbend_service.application.grids import GridLibrary
 from unbend_service.application.illustration import Illustration
+from unbend_service.application.ports import Estimator, GridStore, Meter, RenderPool
 from unbend_service.application.regions import Regions
-from unbend_service.application.ports import GridStore, Meter
 from unbend_service.application.service import Service
 from unbend_service.application.streams import Streams
+from unbend_service.domain.errors import InvalidOption
 from unbend_service.settings import Settings
+
+#: Estimates of another node that are waited for at once: threads that sleep.
+REMOTE_ESTIMATES = 32
 
 
 def build_store(settings: Settings, meter: Meter | None = None) -> GridStore:
@@ -49,6 +57,22 @@ def build_store(settings: Settings, meter: Meter | None = None) -> GridStore:
     return MemoryGridStore(settings)
 
 
+def build_pool(settings: Settings, meter: Meter) -> RenderPool:
+    """The render workers, or none on a node that only estimates."""
+    return AbsentPool() if settings.role == "estimate" else WorkerPool(settings, meter)
+
+
+def build_remote_estimator(settings: Settings) -> RemoteEstimator:
+    """The estimator of a node that only renders. Raises InvalidOption if nothing says where the other node is."""
+    if settings.estimator_address is None:
+        raise InvalidOption(
+            "A node that only renders has to know who estimates.",
+            allowed="host:port of a node with the role all or estimate",
+            setting="estimator_address",
+        )
+    return RemoteEstimator(settings.estimator_address, settings.estimator_timeout_s)
+
+
 def build_exchange() -> Exchange:
     """Grids to and from files alone, for commands: no model is loaded and no worker started."""
     meter = PrometheusMeter()
@@ -67,8 +91,16 @@ def build_service(settings: Settings, meter: PrometheusMeter | None = None) -> S
     codec = PillowCodec(settings)
     store = build_store(settings, meter)
     fitted_grids = FittedGrids(blocking, meter)
-    pool = WorkerPool(settings, meter)
-    estimator = load_estimator(settings.model, settings.estimator_threads or usable_cores())
+    pool = build_pool(settings, meter)
+    estimator: Estimator
+    elsewhere: BlockingWork | None = None
+    closing: tuple[Callable[[], None], ...] = ()
+    if settings.role == "render":
+        remote = build_remote_estimator(settings)
+        elsewhere = BlockingWork(REMOTE_ESTIMATES, settings.queue_frames, meter)
+        estimator, closing = remote, (elsewhere.close, remote.close)
+    else:
+        estimator = load_estimator(settings.model, settings.estimator_threads or usable_cores())
     estimation = Estimation(
         estimator,
         codec,
@@ -79,6 +111,7 @@ def build_service(settings: Settings, meter: PrometheusMeter | None = None) -> S
         grid_points=settings.grid_points,
         min_confidence=settings.min_confidence,
         known_images=settings.known_images,
+        elsewhere=elsewhere,
     )
     correction = Correction(
         estimation,
@@ -90,6 +123,7 @@ def build_service(settings: Settings, meter: PrometheusMeter | None = None) -> S
         meter,
         jpeg_quality=settings.jpeg_quality,
         deadline_s=settings.render_deadline_s,
+        offered=settings.role != "estimate",
     )
     illustration = Illustration(
         estimation, codec, store, OverlayIllustrator(), blocking, jpeg_quality=settings.jpeg_quality
@@ -111,6 +145,8 @@ def build_service(settings: Settings, meter: PrometheusMeter | None = None) -> S
         codec,
         meter,
         blocking,
-        estimator.model,
+        estimator,
         MemoryBudget(settings.bodies_bytes, "bodies_bytes"),
+        role=settings.role,
+        closing=closing,
     )

@@ -92,3 +92,105 @@ class EstimateResponse(_message.Message):
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___EstimateResponse: _TypeAlias = EstimateResponse  # noqa: Y015
+
+@_typing.final
+class EstimateGuidesRequest(_message.Message):
+    """One picture to be looked at, as the network wants it."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    FORMAT_FIELD_NUMBER: _builtins.int
+    DATA_FIELD_NUMBER: _builtins.int
+    data: _builtins.bytes
+    """The picture."""
+    @_builtins.property
+    def format(self) -> _frame_pb2.FrameFormat:
+        """gray8, upright, reduced to what the network can use (1024 pixels on the longer side)."""
+
+    def __init__(
+        self,
+        *,
+        format: _frame_pb2.FrameFormat | None = ...,
+        data: _builtins.bytes = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["format", b"format"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["data", b"data", "format", b"format"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___EstimateGuidesRequest: _TypeAlias = EstimateGuidesRequest  # noqa: Y015
+
+@_typing.final
+class EstimateGuidesResponse(_message.Message):
+    """What the network makes of it."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    GUIDES_FIELD_NUMBER: _builtins.int
+    CONFIDENCE_FIELD_NUMBER: _builtins.int
+    CONFIDENCE_KIND_FIELD_NUMBER: _builtins.int
+    EXPECTED_ERROR_FIELD_NUMBER: _builtins.int
+    MODEL_FIELD_NUMBER: _builtins.int
+    confidence: _builtins.float
+    """0..1; what it means is said by confidence_kind."""
+    confidence_kind: _builtins.str
+    """"mirror_agreement" or "calibrated_probability"."""
+    expected_error: _builtins.float
+    """Expected mean error of the nonlinear part, in half picture widths, 0 and more; absent if the network has no say."""
+    @_builtins.property
+    def guides(self) -> _grid_pb2.Guides:
+        """The guides, centred source coordinates."""
+
+    @_builtins.property
+    def model(self) -> Global___Model:
+        """Which network it was."""
+
+    def __init__(
+        self,
+        *,
+        guides: _grid_pb2.Guides | None = ...,
+        confidence: _builtins.float = ...,
+        confidence_kind: _builtins.str = ...,
+        expected_error: _builtins.float | None = ...,
+        model: Global___Model | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_expected_error", b"_expected_error", "expected_error", b"expected_error", "guides", b"guides", "model", b"model"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_expected_error", b"_expected_error", "confidence", b"confidence", "confidence_kind", b"confidence_kind", "expected_error", b"expected_error", "guides", b"guides", "model", b"model"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__expected_error: _TypeAlias = _typing.Literal["expected_error"]  # noqa: Y015
+    _WhichOneofArgType__expected_error: _TypeAlias = _typing.Literal["_expected_error", b"_expected_error"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__expected_error) -> _WhichOneofReturnType__expected_error | None: ...
+
+Global___EstimateGuidesResponse: _TypeAlias = EstimateGuidesResponse  # noqa: Y015
+
+@_typing.final
+class Model(_message.Message):
+    """A network."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    NAME_FIELD_NUMBER: _builtins.int
+    SHA256_FIELD_NUMBER: _builtins.int
+    MIN_CONFIDENCE_FIELD_NUMBER: _builtins.int
+    name: _builtins.str
+    """Short name."""
+    sha256: _builtins.str
+    """Of the weight file, lower-case hexadecimal."""
+    min_confidence: _builtins.float
+    """0..1, below which its card advises to leave a picture's lens alone."""
+    def __init__(
+        self,
+        *,
+        name: _builtins.str = ...,
+        sha256: _builtins.str = ...,
+        min_confidence: _builtins.float = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["min_confidence", b"min_confidence", "name", b"name", "sha256", b"sha256"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Model: _TypeAlias = Model  # noqa: Y015

@@ -40,6 +40,11 @@ class EstimationServiceStub:
                 request_serializer=unbend_dot_v1_dot_estimation__pb2.EstimateRequest.SerializeToString,
                 response_deserializer=unbend_dot_v1_dot_estimation__pb2.EstimateResponse.FromString,
                 _registered_method=True)
+        self.EstimateGuides = channel.unary_unary(
+                '/unbend.v1.EstimationService/EstimateGuides',
+                request_serializer=unbend_dot_v1_dot_estimation__pb2.EstimateGuidesRequest.SerializeToString,
+                response_deserializer=unbend_dot_v1_dot_estimation__pb2.EstimateGuidesResponse.FromString,
+                _registered_method=True)
 
 
 class EstimationServiceServicer:
@@ -53,6 +58,14 @@ class EstimationServiceServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def EstimateGuides(self, request, context):
+        """Says what the network makes of one picture, before anything is decided, spun or stored: what a node that only
+        renders asks of one that estimates. UNIMPLEMENTED (not_served_here) on a node that only renders.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_EstimationServiceServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -60,6 +73,11 @@ def add_EstimationServiceServicer_to_server(servicer, server):
                     servicer.Estimate,
                     request_deserializer=unbend_dot_v1_dot_estimation__pb2.EstimateRequest.FromString,
                     response_serializer=unbend_dot_v1_dot_estimation__pb2.EstimateResponse.SerializeToString,
+            ),
+            'EstimateGuides': grpc.unary_unary_rpc_method_handler(
+                    servicer.EstimateGuides,
+                    request_deserializer=unbend_dot_v1_dot_estimation__pb2.EstimateGuidesRequest.FromString,
+                    response_serializer=unbend_dot_v1_dot_estimation__pb2.EstimateGuidesResponse.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -90,6 +108,33 @@ class EstimationService:
             '/unbend.v1.EstimationService/Estimate',
             unbend_dot_v1_dot_estimation__pb2.EstimateRequest.SerializeToString,
             unbend_dot_v1_dot_estimation__pb2.EstimateResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def EstimateGuides(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/unbend.v1.EstimationService/EstimateGuides',
+            unbend_dot_v1_dot_estimation__pb2.EstimateGuidesRequest.SerializeToString,
+            unbend_dot_v1_dot_estimation__pb2.EstimateGuidesResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -35,6 +35,10 @@ class EstimationServiceStub:
     def __new__(cls, channel: _aio.Channel) -> EstimationServiceAsyncStub: ...
     Estimate: _grpc.UnaryUnaryMultiCallable[_estimation_pb2.EstimateRequest, _estimation_pb2.EstimateResponse]
     """Estimates the guides of one picture and the grid that they span. The grid is stored under its id."""
+    EstimateGuides: _grpc.UnaryUnaryMultiCallable[_estimation_pb2.EstimateGuidesRequest, _estimation_pb2.EstimateGuidesResponse]
+    """Says what the network makes of one picture, before anything is decided, spun or stored: what a node that only
+    renders asks of one that estimates. UNIMPLEMENTED (not_served_here) on a node that only renders.
+    """
 
 @_typing.type_check_only
 class EstimationServiceAsyncStub(EstimationServiceStub):
@@ -43,6 +47,10 @@ class EstimationServiceAsyncStub(EstimationServiceStub):
     def __init__(self, channel: _aio.Channel) -> None: ...
     Estimate: _aio.UnaryUnaryMultiCallable[_estimation_pb2.EstimateRequest, _estimation_pb2.EstimateResponse]  # type: ignore[assignment]
     """Estimates the guides of one picture and the grid that they span. The grid is stored under its id."""
+    EstimateGuides: _aio.UnaryUnaryMultiCallable[_estimation_pb2.EstimateGuidesRequest, _estimation_pb2.EstimateGuidesResponse]  # type: ignore[assignment]
+    """Says what the network makes of one picture, before anything is decided, spun or stored: what a node that only
+    renders asks of one that estimates. UNIMPLEMENTED (not_served_here) on a node that only renders.
+    """
 
 class EstimationServiceServicer(metaclass=_abc_1.ABCMeta):
     """Looks at one picture and says how it is bent."""
@@ -54,5 +62,15 @@ class EstimationServiceServicer(metaclass=_abc_1.ABCMeta):
         context: _ServicerContext,
     ) -> _typing.Union[_estimation_pb2.EstimateResponse, _abc.Awaitable[_estimation_pb2.EstimateResponse]]:
         """Estimates the guides of one picture and the grid that they span. The grid is stored under its id."""
+
+    @_abc_1.abstractmethod
+    def EstimateGuides(
+        self,
+        request: _estimation_pb2.EstimateGuidesRequest,
+        context: _ServicerContext,
+    ) -> _typing.Union[_estimation_pb2.EstimateGuidesResponse, _abc.Awaitable[_estimation_pb2.EstimateGuidesResponse]]:
+        """Says what the network makes of one picture, before anything is decided, spun or stored: what a node that only
+        renders asks of one that estimates. UNIMPLEMENTED (not_served_here) on a node that only renders.
+        """
 
 def add_EstimationServiceServicer_to_server(servicer: EstimationServiceServicer, server: _typing.Union[_grpc.Server, _aio.Server]) -> None: ...

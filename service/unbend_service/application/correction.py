@@ -16,7 +16,7 @@ from unbend_service.application.ports import (
     RenderPool,
     SharedPicture,
 )
-from unbend_service.domain.errors import InvalidOption, UnbendError
+from unbend_service.domain.errors import InvalidOption, NotServedHere, UnbendError
 from unbend_service.domain.fit import CROP, Fit
 from unbend_service.domain.frames import BLACK, Border, Frame, with_alpha
 from unbend_service.domain.grid import Grid
@@ -80,6 +80,7 @@ class Correction:
         *,
         jpeg_quality: int,
         deadline_s: float,
+        offered: bool = True,
     ) -> None:
         self._estimation = estimation
         self._codec = codec
@@ -90,6 +91,12 @@ class Correction:
         self._meter = meter
         self._jpeg_quality = jpeg_quality
         self._deadline_s = deadline_s
+        self._offered = offered
+
+    def check_offered(self) -> None:
+        """Raises NotServedHere on a node that only estimates."""
+        if not self._offered:
+            raise NotServedHere("This node estimates only.", allowed="role all or render", setting="role")
 
     async def of_image(self, body: bytes, options: CorrectOptions) -> CorrectedImage:
         """Corrects an encoded picture.
@@ -99,8 +106,9 @@ class Correction:
 
         Raises:
             EmptyBody, UnsupportedMediaType, InvalidImage, TooManyPixels, InvalidOption, GridNotFound, QueueFull,
-            DeadlineExceeded, PoisonFrame, RendererUnavailable, Draining.
+            DeadlineExceeded, PoisonFrame, RendererUnavailable, Draining, NotServedHere.
         """
+        self.check_offered()
         if options.image_format not in (None, *WRITTEN_FORMATS):
             raise InvalidOption(f"format={options.image_format!r} is not written.", allowed=", ".join(WRITTEN_FORMATS))
         image = await self._blocking.run("decode", self._codec.decode, body)
@@ -120,6 +128,7 @@ class Correction:
 
     async def of_frame(self, frame: Frame, options: CorrectOptions) -> CorrectedFrame:
         """Corrects a raw picture; raises as :meth:`of_image`."""
+        self.check_offered()
         record = await self._record(frame, options)
         return CorrectedFrame(await self.render(frame, record, options), record)
 

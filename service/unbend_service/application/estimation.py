@@ -12,7 +12,7 @@ from unbend_service.application.known import HASHED_AT_ONCE_BYTES, Known, digest
 from unbend_service.application.ports import Bytes, Estimate, Estimator, GridStore, ImageCodec, Meter
 from unbend_service.domain.aggregation import Look, fuse
 from unbend_service.domain.decision import decide
-from unbend_service.domain.errors import InvalidOption
+from unbend_service.domain.errors import InvalidOption, NotServedHere
 from unbend_service.domain.fit import KEEP, Fit
 from unbend_service.domain.frames import Frame
 from unbend_service.domain.records import Correct, GridRecord
@@ -49,6 +49,7 @@ class Estimation:
         min_confidence: below which a picture is left alone; None takes the estimator's advice, which speaks of the lens
             and is therefore not followed where the whole of the map was asked for.
         known_images: pictures whose estimate is kept.
+        elsewhere: where calls of the estimator wait if it is on another node; they take no core here.
     """
 
     def __init__(
@@ -63,6 +64,7 @@ class Estimation:
         grid_points: int,
         min_confidence: float | None,
         known_images: int = 1024,
+        elsewhere: BlockingWork | None = None,
     ) -> None:
         self._known: Known[Estimate] = Known(known_images)
         self._estimator = estimator
@@ -73,10 +75,17 @@ class Estimation:
         self._meter = meter
         self._grid_points = grid_points
         self._min_confidence = min_confidence
+        self._elsewhere = elsewhere
 
     async def of_grey(self, grey: Bytes) -> Estimate:
-        """What the estimator says of a (height, width) uint8 picture."""
-        return await self._blocking.run("estimate", self._estimator.estimate, grey)
+        """What the estimator says of a (height, width) uint8 picture; EstimatorUnavailable if it is away."""
+        return await (self._elsewhere or self._blocking).run("estimate", self._estimator.estimate, grey)
+
+    async def for_another_node(self, grey: Bytes) -> Estimate:
+        """As :meth:`of_grey`, but never asked of a third node. Raises NotServedHere."""
+        if self._elsewhere is not None:
+            raise NotServedHere("This node renders only.", allowed="role all or estimate", setting="role")
+        return await self.of_grey(grey)
 
     async def record(self, estimate: Estimate, correct: Correct, min_confidence: float | None = None) -> GridRecord:
         """The decision on an estimate, at full strength and without fit; stored and counted."""

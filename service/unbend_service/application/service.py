@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from unbend_service.application.admission import Admission
@@ -13,7 +14,7 @@ from unbend_service.application.estimation import Estimation
 from unbend_service.application.exchange import Exchange
 from unbend_service.application.grids import GridLibrary
 from unbend_service.application.illustration import Illustration
-from unbend_service.application.ports import GridStore, ImageCodec, Meter, ModelInfo, PoolState, RenderPool
+from unbend_service.application.ports import Estimator, GridStore, ImageCodec, Meter, ModelInfo, PoolState, RenderPool
 from unbend_service.application.regions import Regions
 from unbend_service.application.streams import Streams
 
@@ -28,6 +29,7 @@ class Readiness:
         model: the network that estimates.
         streams: streams that are open.
         active: calls under way.
+        role: what this node does: all, estimate or render.
     """
 
     ready: bool
@@ -36,11 +38,17 @@ class Readiness:
     model: ModelInfo
     streams: int
     active: int
+    role: str = "all"
 
 
 @dataclass(slots=True)
 class Service:
-    """Use cases and what they share; ``bodies`` bounds the request bodies in memory."""
+    """Use cases and what they share.
+
+    Attributes:
+        bodies: bounds the request bodies in memory.
+        closing: called last, for what else has to be freed.
+    """
 
     estimation: Estimation
     correction: Correction
@@ -54,9 +62,16 @@ class Service:
     codec: ImageCodec
     meter: Meter
     blocking: BlockingWork
-    model: ModelInfo
+    estimator: Estimator
     bodies: MemoryBudget
     admission: Admission = field(default_factory=Admission)
+    role: str = "all"
+    closing: tuple[Callable[[], None], ...] = ()
+
+    @property
+    def model(self) -> ModelInfo:
+        """The network that estimates; of another node what it said last."""
+        return self.estimator.model
 
     async def start(self) -> None:
         """Starts the render workers. Raises RendererUnavailable."""
@@ -70,7 +85,7 @@ class Service:
         reasons = [] if state.ready else [state.reason]
         if self.admission.draining:
             reasons.append("The service is shutting down.")
-        return Readiness(not reasons, reasons, state, self.model, self.streams.active, self.admission.active)
+        return Readiness(not reasons, reasons, state, self.model, self.streams.active, self.admission.active, self.role)
 
     async def close(self, grace_s: float) -> None:
         """Refuses new calls, lets those under way finish for ``grace_s`` seconds, then frees everything."""
@@ -79,3 +94,5 @@ class Service:
         await self.pool.close(max(0.0, end - time.monotonic()))
         self.blocking.close()
         await self.store.close()
+        for free in self.closing:
+            free()

@@ -58,10 +58,11 @@ class Streams:
 
         Raises:
             InvalidOption, InvalidFrame, UnsupportedPixelFormat, TooManyPixels, GridNotFound, InvalidGuides,
-            InvalidGrid, FoldedGrid: the stream cannot be as it was asked for.
+            InvalidGrid, FoldedGrid, NotServedHere: the stream cannot be as it was asked for.
             TooManyStreams, Draining: not now.
             StreamTakenOver, StreamIdle: later, inside the block, which is cancelled for it.
         """
+        self._correction.check_offered()
         config.check(self._settings.source_pixels)
         if self._draining:
             raise Draining("The service is shutting down.", retry_after_s=0.1)

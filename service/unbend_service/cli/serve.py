@@ -20,6 +20,8 @@ def serve(
     renderer: Annotated[str | None, typer.Option(help="auto, egl or cpu [default: auto].")] = None,
     model: Annotated[str | None, typer.Option(help="Name of a shipped model, or a path.")] = None,
     workers: Annotated[int | None, typer.Option(help="Render workers; 0: one a core [default: 0].")] = None,
+    role: Annotated[str | None, typer.Option(help="all, estimate or render [default: all].")] = None,
+    estimator: Annotated[str | None, typer.Option(help="With --role render: host:port of who estimates.")] = None,
 ) -> None:
     """Serve HTTP and gRPC until SIGTERM. Every setting is also a variable UNBEND_...; see docs/configuration.md."""
     chosen: dict[str, Any] = {
@@ -30,6 +32,8 @@ def serve(
         "renderer": renderer,
         "model": model,
         "workers": workers,
+        "role": role,
+        "estimator_address": estimator,
     }
     settings = read_settings(**{name: value for name, value in chosen.items() if value is not None})
     configure_logs(settings)

@@ -21,6 +21,7 @@ The tree (each leaf has a stable ``code``, which both transports put on the wire
     ├── GridNotFound
     ├── RegionNotFound
     ├── GridConflict
+    ├── NotServedHere
     ├── Overloaded
     │   ├── QueueFull
     │   ├── MemoryFull
@@ -28,6 +29,7 @@ The tree (each leaf has a stable ``code``, which both transports put on the wire
     │   └── TooManyStreams
     ├── Unavailable
     │   ├── Draining
+    │   ├── EstimatorUnavailable
     │   ├── GridStoreUnavailable
     │   ├── ModelUnavailable
     │   └── RendererUnavailable
@@ -190,6 +192,12 @@ class GridConflict(UnbendError):
     code = "grid_conflict"
 
 
+class NotServedHere(UnbendError):
+    """The role of this service leaves this kind of work to others."""
+
+    code = "not_served_here"
+
+
 class Overloaded(UnbendError):
     """The service is at one of its limits; trying later may help."""
 
@@ -230,6 +238,12 @@ class Draining(Unavailable):
     """The service is shutting down and accepts nothing new."""
 
     code = "draining"
+
+
+class EstimatorUnavailable(Unavailable):
+    """The estimation node that a render node asks does not answer."""
+
+    code = "estimator_unavailable"
 
 
 class GridStoreUnavailable(Unavailable):

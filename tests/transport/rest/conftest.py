@@ -77,7 +77,7 @@ class Bench:
             codec=codec,
             meter=meter,
             blocking=blocking,
-            model=self.estimator.model,
+            estimator=self.estimator,
             bodies=MemoryBudget(settings.bodies_bytes, "bodies_bytes"),
         )
         self.app = create_app(self.service, settings)

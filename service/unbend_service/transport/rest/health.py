@@ -45,6 +45,7 @@ class ReadinessBody(BaseModel):
     queued: int
     streams: int
     active: int
+    role: str
 
 
 def describe(readiness: Readiness) -> dict[str, Any]:
@@ -60,6 +61,7 @@ def describe(readiness: Readiness) -> dict[str, Any]:
         "queued": readiness.pool.queued,
         "streams": readiness.streams,
         "active": readiness.active,
+        "role": readiness.role,
     }
 
 
@@ -101,6 +103,7 @@ def router(service: Service) -> APIRouter:
     async def metrics() -> Response:
         """Seconds and bytes."""
         service.meter.pool(service.pool.state())
+        service.meter.model(service.model)
         body, content_type = service.meter.render()
         return Response(body, media_type=content_type)
 

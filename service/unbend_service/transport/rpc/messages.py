@@ -23,6 +23,7 @@ Parse = Callable[[bytes], Any]
 #: Field numbers that lead to the pixels, the file or the lattice of a method's requests; others have no payload.
 _PAYLOADS: dict[str, tuple[int, ...]] = {
     "/unbend.v1.EstimationService/Estimate": (2,),  # data
+    "/unbend.v1.EstimationService/EstimateGuides": (2,),  # data
     "/unbend.v1.CorrectionService/Correct": (2,),  # data
     "/unbend.v1.CorrectionService/CorrectStream": (2, 3),  # frame.data
     "/unbend.v1.GridService/PutGrid": (1, 3),  # grid.source
