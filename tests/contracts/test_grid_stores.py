@@ -59,7 +59,11 @@ async def store(request: pytest.FixtureRequest, tmp_path: Path, clock: Clock) ->
     settings = Settings(grid_store_entries=ENTRIES, grid_store_ttl_s=TTL_S, grid_store_path=tmp_path / "grids.sqlite3")
     if request.param in ("redis", "sheltered"):
         port = request.getfixturevalue("redis").port
-        chosen = {"redis_url": f"redis://127.0.0.1:{port}/0", "redis_prefix": f"t{secrets.token_hex(6)}"}
+        chosen = {
+            "redis_url": f"redis://127.0.0.1:{port}/0",
+            "redis_prefix": f"t{secrets.token_hex(6)}",
+            "redis_timeout_s": 10.0,
+        }
         settings = settings.model_copy(update=chosen)
     made = built(request.param, settings, clock)
     yield made

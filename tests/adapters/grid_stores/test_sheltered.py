@@ -33,7 +33,7 @@ class Replica:
     """One replica's view of the store."""
 
     def __init__(self, server: Companion) -> None:
-        settings = Settings(redis_url=f"redis://127.0.0.1:{server.port}/0", redis_timeout_s=0.3)
+        settings = Settings(redis_url=f"redis://127.0.0.1:{server.port}/0", redis_timeout_s=1.0)
         self.meter = RecordingMeter()
         shared = RedisGridStore(settings, self.meter)
         self.store = ShelteredGridStore(shared, MemoryGridStore(settings), self.meter, retry_s=0.1, owed_entries=8)
@@ -92,7 +92,7 @@ async def test_only_the_first_call_waits_for_a_server_that_hangs(
     start = time.monotonic()
     for _ in range(100):
         assert (await store.get(FIRST.id)).id == FIRST.id
-    assert time.monotonic() - start < 1.0
+    assert time.monotonic() - start < 4.0
     server.resume()
     await replicas[0].recovered()
     assert (await store.get(FIRST.id)).id == FIRST.id
