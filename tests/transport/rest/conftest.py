@@ -23,6 +23,7 @@ from unbend_service.application.exchange import Exchange
 from unbend_service.application.fitting import FittedGrids
 from unbend_service.application.grids import GridLibrary
 from unbend_service.application.illustration import Illustration
+from unbend_service.application.regions import Regions
 from unbend_service.application.service import Service
 from unbend_service.application.streams import Streams
 from unbend_service.settings import Settings
@@ -65,13 +66,15 @@ class Bench:
             deadline_s=settings.render_deadline_s,
         )
         illustration = Illustration(estimation, codec, store, OverlayIllustrator(), blocking, jpeg_quality=90)
+        regions = Regions(self.pool, settings.local_memory_bytes)
         self.service = Service(
             estimation=estimation,
             correction=correction,
             illustration=illustration,
             grids=GridLibrary(store, blocking, grid_points=settings.grid_points),
             exchange=Exchange(ExchangeFiles(), fitted, blocking),
-            streams=Streams(estimation, correction, store, codec, blocking, meter, settings),
+            streams=Streams(estimation, correction, store, codec, blocking, meter, regions, settings),
+            regions=regions,
             pool=self.pool,
             store=store,
             codec=codec,
