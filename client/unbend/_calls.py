@@ -60,6 +60,7 @@ def correct_call(
     quality: int | None = None,
     answer_format: str | None = None,
     min_confidence: float | None = None,
+    camera: str = "",
 ) -> Call[types.Correction]:
     """Raises InvalidInput for what cannot be sent."""
     packed = pack(image, pixel_format)
@@ -70,6 +71,7 @@ def correct_call(
         rendering=to_rendering(fit, strength, border, quality),
         grid_id=grid_id or "",
         min_confidence=min_confidence,
+        camera=camera,
     )
     if answer_format is not None:
         if answer_format not in ENCODED:
@@ -92,6 +94,7 @@ def estimate_call(
     fit: str | float = "keep",
     strength: float = 1.0,
     min_confidence: float | None = None,
+    camera: str = "",
 ) -> Call[types.Estimate]:
     """Raises InvalidInput for what cannot be sent."""
     packed = pack(image, pixel_format)
@@ -102,6 +105,7 @@ def estimate_call(
         fit=str(fit),
         strength=strength,
         min_confidence=min_confidence,
+        camera=camera,
     )
 
     def parse(answer: estimation_pb2.EstimateResponse) -> types.Estimate:

@@ -88,6 +88,7 @@ class Client:
         answer_format: str | None = None,
         grid: calls.GridLike | None = None,
         min_confidence: float | None = None,
+        camera: str = "",
     ) -> types.Correction:
         """Straightens one picture.
 
@@ -109,6 +110,8 @@ class Client:
             grid: used instead of an estimate: an id, a record, an estimate or an earlier correction, a lattice or
                 guides.
             min_confidence: 0..1; below it the picture is left alone. The server's setting if left out.
+            camera: whose picture it is, a name of your own: what pictures of one camera say of its lens adds up.
+                ``exif`` takes it from the file.
 
         Returns:
             The corrected picture, an array of the same shape or a file, and the grid behind it; ``to_pil()`` and
@@ -130,6 +133,7 @@ class Client:
                 quality=quality,
                 answer_format=answer_format,
                 min_confidence=min_confidence,
+                camera=camera,
             )
         )
 
@@ -142,6 +146,7 @@ class Client:
         fit: str | float = "keep",
         strength: float = 1.0,
         min_confidence: float | None = None,
+        camera: str = "",
     ) -> types.Estimate:
         """Says how a picture is bent, without drawing it; arguments and errors as of :meth:`correct`.
 
@@ -157,6 +162,7 @@ class Client:
                 fit=fit,
                 strength=strength,
                 min_confidence=min_confidence,
+                camera=camera,
             )
         )
 

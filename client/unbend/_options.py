@@ -15,6 +15,7 @@ class EstimateOptions(TypedDict, total=False):
     fit: str | float
     strength: float
     min_confidence: float | None
+    camera: str
 
 
 class CorrectOptions(EstimateOptions, total=False):

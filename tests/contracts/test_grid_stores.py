@@ -240,3 +240,26 @@ async def test_a_claim_lapses_unless_it_is_renewed(store: GridStore, clock: Cloc
     assert not await store.claim_stream("camera-7", "heir", 0.3)
     await pass_by(0.2)
     assert await store.claim_stream("camera-7", "heir", 0.3)
+async def test_what_is_remembered_of_a_camera_is_swapped_for_what_is_known(store: GridStore) -> None:
+    """Of two that write at the same time the second is told, and nothing is overwritten."""
+    assert await store.camera("dashcam") is None
+    assert await store.swap_camera("dashcam", None, b"one")
+    assert not await store.swap_camera("dashcam", None, b"two")
+    assert not await store.swap_camera("dashcam", b"zero", b"two")
+    assert await store.camera("dashcam") == b"one"
+
+    assert await store.swap_camera("dashcam", b"one", b"two")
+    assert await store.camera("dashcam") == b"two"
+    assert await store.swap_camera("dashcam", b"two", None)
+    assert await store.camera("dashcam") is None
+
+
+async def test_cameras_are_bounded_and_forgotten_like_grids(store: GridStore, clock: Clock) -> None:
+    for name in "abcd":
+        assert await store.swap_camera(name, None, name.encode())
+
+    assert await store.camera("a") is None
+    assert await store.camera("d") == b"d"
+
+    clock.now += TTL_S + 1
+    assert await store.camera("d") is None

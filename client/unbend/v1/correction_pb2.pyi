@@ -117,6 +117,7 @@ class CorrectRequest(_message.Message):
     GRID_ID_FIELD_NUMBER: _builtins.int
     MIN_CONFIDENCE_FIELD_NUMBER: _builtins.int
     ANSWER_FORMAT_FIELD_NUMBER: _builtins.int
+    CAMERA_FIELD_NUMBER: _builtins.int
     data: _builtins.bytes
     """The picture."""
     correct: _grid_pb2.Correct.ValueType
@@ -127,6 +128,8 @@ class CorrectRequest(_message.Message):
     """Below this confidence, 0..1, the picture is left alone; absent means the server's setting."""
     answer_format: _frame_pb2.PixelFormat.ValueType
     """Layout of the answer if an encoded picture is to come back in another encoded format; unspecified: that of format."""
+    camera: _builtins.str
+    """Whose picture it is, as in EstimateRequest; ignored with a grid_id."""
     @_builtins.property
     def format(self) -> _frame_pb2.FrameFormat:
         """How data is laid out; the answer has the same layout. Of an encoded picture it says only how the answer is to be
@@ -147,10 +150,11 @@ class CorrectRequest(_message.Message):
         grid_id: _builtins.str = ...,
         min_confidence: _builtins.float | None = ...,
         answer_format: _frame_pb2.PixelFormat.ValueType = ...,
+        camera: _builtins.str = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_min_confidence", b"_min_confidence", "format", b"format", "min_confidence", b"min_confidence", "rendering", b"rendering"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_min_confidence", b"_min_confidence", "answer_format", b"answer_format", "correct", b"correct", "data", b"data", "format", b"format", "grid_id", b"grid_id", "min_confidence", b"min_confidence", "rendering", b"rendering"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_min_confidence", b"_min_confidence", "answer_format", b"answer_format", "camera", b"camera", "correct", b"correct", "data", b"data", "format", b"format", "grid_id", b"grid_id", "min_confidence", b"min_confidence", "rendering", b"rendering"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__min_confidence: _TypeAlias = _typing.Literal["min_confidence"]  # noqa: Y015
     _WhichOneofArgType__min_confidence: _TypeAlias = _typing.Literal["_min_confidence", b"_min_confidence"]  # noqa: Y015

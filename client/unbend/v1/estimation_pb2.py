@@ -26,7 +26,7 @@ from unbend.v1 import frame_pb2 as unbend_dot_v1_dot_frame__pb2
 from unbend.v1 import grid_pb2 as unbend_dot_v1_dot_grid__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1aunbend/v1/estimation.proto\x12\tunbend.v1\x1a\x15unbend/v1/frame.proto\x1a\x14unbend/v1/grid.proto\"\xcd\x01\n\x0f\x45stimateRequest\x12&\n\x06\x66ormat\x18\x01 \x01(\x0b\x32\x16.unbend.v1.FrameFormat\x12\x0c\n\x04\x64\x61ta\x18\x02 \x01(\x0c\x12#\n\x07\x63orrect\x18\x03 \x01(\x0e\x32\x12.unbend.v1.Correct\x12\x0b\n\x03\x66it\x18\x04 \x01(\t\x12\x15\n\x08strength\x18\x05 \x01(\x01H\x00\x88\x01\x01\x12\x1b\n\x0emin_confidence\x18\x06 \x01(\x01H\x01\x88\x01\x01\x42\x0b\n\t_strengthB\x11\n\x0f_min_confidence\"9\n\x10\x45stimateResponse\x12%\n\x06record\x18\x01 \x01(\x0b\x32\x15.unbend.v1.GridRecord\"M\n\x15\x45stimateGuidesRequest\x12&\n\x06\x66ormat\x18\x01 \x01(\x0b\x32\x16.unbend.v1.FrameFormat\x12\x0c\n\x04\x64\x61ta\x18\x02 \x01(\x0c\"\xb9\x01\n\x16\x45stimateGuidesResponse\x12!\n\x06guides\x18\x01 \x01(\x0b\x32\x11.unbend.v1.Guides\x12\x12\n\nconfidence\x18\x02 \x01(\x01\x12\x17\n\x0f\x63onfidence_kind\x18\x03 \x01(\t\x12\x1b\n\x0e\x65xpected_error\x18\x04 \x01(\x01H\x00\x88\x01\x01\x12\x1f\n\x05model\x18\x05 \x01(\x0b\x32\x10.unbend.v1.ModelB\x11\n\x0f_expected_error\"=\n\x05Model\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06sha256\x18\x02 \x01(\t\x12\x16\n\x0emin_confidence\x18\x03 \x01(\x01\x32\xaf\x01\n\x11\x45stimationService\x12\x43\n\x08\x45stimate\x12\x1a.unbend.v1.EstimateRequest\x1a\x1b.unbend.v1.EstimateResponse\x12U\n\x0e\x45stimateGuides\x12 .unbend.v1.EstimateGuidesRequest\x1a!.unbend.v1.EstimateGuidesResponseb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1aunbend/v1/estimation.proto\x12\tunbend.v1\x1a\x15unbend/v1/frame.proto\x1a\x14unbend/v1/grid.proto\"\xdd\x01\n\x0f\x45stimateRequest\x12&\n\x06\x66ormat\x18\x01 \x01(\x0b\x32\x16.unbend.v1.FrameFormat\x12\x0c\n\x04\x64\x61ta\x18\x02 \x01(\x0c\x12#\n\x07\x63orrect\x18\x03 \x01(\x0e\x32\x12.unbend.v1.Correct\x12\x0b\n\x03\x66it\x18\x04 \x01(\t\x12\x15\n\x08strength\x18\x05 \x01(\x01H\x00\x88\x01\x01\x12\x1b\n\x0emin_confidence\x18\x06 \x01(\x01H\x01\x88\x01\x01\x12\x0e\n\x06\x63\x61mera\x18\x07 \x01(\tB\x0b\n\t_strengthB\x11\n\x0f_min_confidence\"9\n\x10\x45stimateResponse\x12%\n\x06record\x18\x01 \x01(\x0b\x32\x15.unbend.v1.GridRecord\"M\n\x15\x45stimateGuidesRequest\x12&\n\x06\x66ormat\x18\x01 \x01(\x0b\x32\x16.unbend.v1.FrameFormat\x12\x0c\n\x04\x64\x61ta\x18\x02 \x01(\x0c\"\xb9\x01\n\x16\x45stimateGuidesResponse\x12!\n\x06guides\x18\x01 \x01(\x0b\x32\x11.unbend.v1.Guides\x12\x12\n\nconfidence\x18\x02 \x01(\x01\x12\x17\n\x0f\x63onfidence_kind\x18\x03 \x01(\t\x12\x1b\n\x0e\x65xpected_error\x18\x04 \x01(\x01H\x00\x88\x01\x01\x12\x1f\n\x05model\x18\x05 \x01(\x0b\x32\x10.unbend.v1.ModelB\x11\n\x0f_expected_error\"=\n\x05Model\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06sha256\x18\x02 \x01(\t\x12\x16\n\x0emin_confidence\x18\x03 \x01(\x01\x32\xaf\x01\n\x11\x45stimationService\x12\x43\n\x08\x45stimate\x12\x1a.unbend.v1.EstimateRequest\x1a\x1b.unbend.v1.EstimateResponse\x12U\n\x0e\x45stimateGuides\x12 .unbend.v1.EstimateGuidesRequest\x1a!.unbend.v1.EstimateGuidesResponseb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -34,15 +34,15 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'unbend.v1.estimation_pb2', 
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_ESTIMATEREQUEST']._serialized_start=87
-  _globals['_ESTIMATEREQUEST']._serialized_end=292
-  _globals['_ESTIMATERESPONSE']._serialized_start=294
-  _globals['_ESTIMATERESPONSE']._serialized_end=351
-  _globals['_ESTIMATEGUIDESREQUEST']._serialized_start=353
-  _globals['_ESTIMATEGUIDESREQUEST']._serialized_end=430
-  _globals['_ESTIMATEGUIDESRESPONSE']._serialized_start=433
-  _globals['_ESTIMATEGUIDESRESPONSE']._serialized_end=618
-  _globals['_MODEL']._serialized_start=620
-  _globals['_MODEL']._serialized_end=681
-  _globals['_ESTIMATIONSERVICE']._serialized_start=684
-  _globals['_ESTIMATIONSERVICE']._serialized_end=859
+  _globals['_ESTIMATEREQUEST']._serialized_end=308
+  _globals['_ESTIMATERESPONSE']._serialized_start=310
+  _globals['_ESTIMATERESPONSE']._serialized_end=367
+  _globals['_ESTIMATEGUIDESREQUEST']._serialized_start=369
+  _globals['_ESTIMATEGUIDESREQUEST']._serialized_end=446
+  _globals['_ESTIMATEGUIDESRESPONSE']._serialized_start=449
+  _globals['_ESTIMATEGUIDESRESPONSE']._serialized_end=634
+  _globals['_MODEL']._serialized_start=636
+  _globals['_MODEL']._serialized_end=697
+  _globals['_ESTIMATIONSERVICE']._serialized_start=700
+  _globals['_ESTIMATIONSERVICE']._serialized_end=875
 # @@protoc_insertion_point(module_scope)

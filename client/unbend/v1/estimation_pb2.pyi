@@ -30,6 +30,7 @@ class EstimateRequest(_message.Message):
     FIT_FIELD_NUMBER: _builtins.int
     STRENGTH_FIELD_NUMBER: _builtins.int
     MIN_CONFIDENCE_FIELD_NUMBER: _builtins.int
+    CAMERA_FIELD_NUMBER: _builtins.int
     data: _builtins.bytes
     """The picture."""
     correct: _grid_pb2.Correct.ValueType
@@ -40,6 +41,10 @@ class EstimateRequest(_message.Message):
     """0..1; absent means 1."""
     min_confidence: _builtins.float
     """Below this confidence, 0..1, the picture is left alone; absent means the server's setting."""
+    camera: _builtins.str
+    """Whose picture it is, 1 to 128 letters, digits and . _ : @ / + -: what pictures of one camera say of its lens adds
+    up. "exif" takes make, model, lens and focal length from the file. Empty: the picture stands alone.
+    """
     @_builtins.property
     def format(self) -> _frame_pb2.FrameFormat:
         """How data is laid out."""
@@ -53,10 +58,11 @@ class EstimateRequest(_message.Message):
         fit: _builtins.str = ...,
         strength: _builtins.float | None = ...,
         min_confidence: _builtins.float | None = ...,
+        camera: _builtins.str = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_min_confidence", b"_min_confidence", "_strength", b"_strength", "format", b"format", "min_confidence", b"min_confidence", "strength", b"strength"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_min_confidence", b"_min_confidence", "_strength", b"_strength", "correct", b"correct", "data", b"data", "fit", b"fit", "format", b"format", "min_confidence", b"min_confidence", "strength", b"strength"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_min_confidence", b"_min_confidence", "_strength", b"_strength", "camera", b"camera", "correct", b"correct", "data", b"data", "fit", b"fit", "format", b"format", "min_confidence", b"min_confidence", "strength", b"strength"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__min_confidence: _TypeAlias = _typing.Literal["min_confidence"]  # noqa: Y015
     _WhichOneofArgType__min_confidence: _TypeAlias = _typing.Literal["_min_confidence", b"_min_confidence"]  # noqa: Y015

@@ -30,7 +30,7 @@ class CorrectOptions:
     """How a picture is to be corrected.
 
     Attributes:
-        correct, min_confidence: of the estimate; ignored with ``grid_id``.
+        correct, min_confidence, camera: of the estimate; ignored with ``grid_id``.
         fit, strength, border: of the rendering.
         quality: 1..100 for jpeg and webp; None takes the setting.
         image_format: ``jpeg``, ``png`` or ``webp``; None keeps the format of the source (png for one that is not
@@ -46,6 +46,7 @@ class CorrectOptions:
     image_format: str | None = None
     grid_id: str | None = None
     min_confidence: float | None = None
+    camera: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,12 +183,16 @@ class Correction:
     async def _record_of_image(self, body: bytes, options: CorrectOptions) -> GridRecord:
         if options.grid_id is not None:
             return await self._store.get(options.grid_id)
-        return await self._estimation.of_image(body, options.correct, min_confidence=options.min_confidence)
+        return await self._estimation.of_image(
+            body, options.correct, min_confidence=options.min_confidence, camera=options.camera
+        )
 
     async def _record(self, frame: Frame, options: CorrectOptions) -> GridRecord:
         if options.grid_id is not None:
             return await self._store.get(options.grid_id)
-        return await self._estimation.of_frame(frame, options.correct, min_confidence=options.min_confidence)
+        return await self._estimation.of_frame(
+            frame, options.correct, min_confidence=options.min_confidence, camera=options.camera
+        )
 
 
 def leaves_alone(record: GridRecord) -> bool:

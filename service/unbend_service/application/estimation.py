@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Awaitable, Callable, Sequence
 
 from unbend_service.application.blocking import BlockingWork
+from unbend_service.application.cameras import Cameras
 from unbend_service.application.fitting import FittedGrids
 from unbend_service.application.grey import grey_of_frame
 from unbend_service.application.known import HASHED_AT_ONCE_BYTES, Known, digest
@@ -17,6 +18,8 @@ from unbend_service.domain.fit import KEEP, Fit
 from unbend_service.domain.frames import Frame
 from unbend_service.domain.records import Correct, GridRecord
 
+#: Names the camera that the picture's own EXIF block names.
+EXIF_CAMERA = "exif"
 #: Longer side to which pictures are reduced before an estimator sees them.
 ESTIMATE_LONGEST_PX = 1024
 
@@ -67,6 +70,7 @@ class Estimation:
         elsewhere: BlockingWork | None = None,
     ) -> None:
         self._known: Known[Estimate] = Known(known_images)
+        self.cameras = Cameras(store, blocking, estimator.model)
         self._estimator = estimator
         self._codec = codec
         self._store = store
@@ -119,8 +123,13 @@ class Estimation:
         fit: Fit = KEEP,
         strength: float = 1.0,
         min_confidence: float | None = None,
+        camera: str | None = None,
     ) -> GridRecord:
         """Estimates an encoded picture; the stored grid is the one that correct, fit and strength describe.
+
+        Args:
+            camera: whose picture it is: what its other pictures said counts too, see `cameras`. ``exif`` takes the
+                make, model, lens and focal length that the file names, or nothing if it names none.
 
         Raises:
             EmptyBody, UnsupportedMediaType, InvalidImage, TooManyPixels, InvalidOption, QueueFull.
@@ -131,7 +140,11 @@ class Estimation:
                 await self._blocking.run("decode", self._codec.decode_grey, body, ESTIMATE_LONGEST_PX)
             )
 
-        estimate = await self._known.get(await self._digest(body), look)
+        aspect = 0.0
+        if camera:
+            origin = await self._blocking.run("decode", self._codec.origin, body)
+            aspect, camera = origin.aspect, origin.camera if camera == EXIF_CAMERA else camera
+        estimate = await self._looked(await self._digest(body), look, camera, aspect)
         return await self._described(estimate, correct, fit, strength, min_confidence)
 
     async def of_frame(
@@ -141,15 +154,27 @@ class Estimation:
         fit: Fit = KEEP,
         strength: float = 1.0,
         min_confidence: float | None = None,
+        camera: str | None = None,
     ) -> GridRecord:
-        """As :meth:`of_image`, for a raw picture."""
+        """As :meth:`of_image`, for a raw picture, which has no EXIF block."""
         layout = f"{frame.pixel_format} {frame.width} {frame.height}".encode()
 
         async def look() -> Estimate:
             return await self.of_grey(await self._blocking.run("decode", grey_of_frame, frame, ESTIMATE_LONGEST_PX))
 
-        estimate = await self._known.get(await self._digest(layout, frame.data), look)
+        picture = await self._digest(layout, frame.data)
+        named = None if camera == EXIF_CAMERA else camera
+        estimate = await self._looked(picture, look, named, frame.width / frame.height)
         return await self._described(estimate, correct, fit, strength, min_confidence)
+
+    async def _looked(
+        self, picture: bytes, look: Callable[[], Awaitable[Estimate]], camera: str | None, aspect: float
+    ) -> Estimate:
+        """The estimate of a picture, with what its camera's other pictures said."""
+        if not camera:
+            return await self._known.get(picture, look)
+        locked = await self.cameras.locked(camera, aspect)
+        return locked or await self.cameras.add(camera, aspect, await self._known.get(picture, look), picture.hex())
 
     async def _digest(self, *parts: bytes | Bytes) -> bytes:
         if sum(len(part) for part in parts) <= HASHED_AT_ONCE_BYTES:

@@ -250,6 +250,18 @@ class GridStore(Protocol):
         """Gives a claim up; without effect if it is not ``token``'s."""
         ...
 
+    async def camera(self, name: str) -> bytes | None:
+        """What is remembered of a camera, None if nothing (any more)."""
+        ...
+
+    async def swap_camera(self, name: str, known: bytes | None, value: bytes | None) -> bool:
+        """Replaces what is remembered of a camera, if that is still ``known``; None stands for nothing on both sides.
+
+        Returns:
+            Whether it was: someone else may have been faster.
+        """
+        ...
+
     async def close(self) -> None: ...
 
 
@@ -267,6 +279,19 @@ class ImageHeader:
     width: int
     height: int
     has_alpha: bool
+
+
+@dataclass(frozen=True, slots=True)
+class PictureOrigin:
+    """What the header of an encoded picture says of its making.
+
+    Attributes:
+        aspect: width over height, upright.
+        camera: a name for the camera, lens and focal length; None if the file names none.
+    """
+
+    aspect: float
+    camera: str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -299,6 +324,10 @@ class ImageCodec(Protocol):
         Raises:
             EmptyBody, UnsupportedMediaType, InvalidImage, TooManyPixels.
         """
+        ...
+
+    def origin(self, body: bytes) -> PictureOrigin:
+        """Reads the header only; raises as :meth:`probe`."""
         ...
 
     def decode(self, body: bytes) -> DecodedImage:

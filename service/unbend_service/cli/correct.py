@@ -37,6 +37,9 @@ def correct(
     min_confidence: Annotated[
         float | None, typer.Option(min=0, max=1, help="Leave the picture alone below this confidence.")
     ] = None,
+    camera: Annotated[
+        str | None, typer.Option(help="All photographs are of one camera: a name of yours; exif: as the files say.")
+    ] = None,
     model: Annotated[str | None, typer.Option(help="Name of a shipped model, or a path.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT if it is there.")] = False,
     workers: Annotated[int, typer.Option(min=0, help="Render workers for many photographs; 0: one a core.")] = 0,
@@ -56,6 +59,7 @@ def correct(
                 strength=check_strength(strength),
                 quality=quality,
                 min_confidence=min_confidence,
+                camera=camera,
             )
             batch_settings: dict[str, Any] = {"workers": workers} | ({} if model is None else {"model": model})
             batch = correct_jobs(read_settings(**batch_settings), jobs, batch_options, overwrite=overwrite)
@@ -74,6 +78,7 @@ def correct(
             quality=quality,
             image_format=image_format,
             min_confidence=min_confidence,
+            camera=camera,
         )
         chosen: dict[str, Any] = {"workers": 1} | ({} if model is None else {"model": model})
         result = asyncio.run(_correct(read_settings(**chosen), Path(source).read_bytes(), options))

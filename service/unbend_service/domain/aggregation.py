@@ -139,7 +139,7 @@ def _parts(looks: Sequence[Look], target: Float64) -> tuple[list[Look], Float64,
     for look in looks:
         try:
             pose = plane_part(look.guides)
-            lens = look.guides(apply_homography(np.linalg.inv(pose), target))
+            lens = look.guides(apply_homography(_inverse(pose), target))
         except (InvalidGuides, InvalidGrid, np.linalg.LinAlgError):
             continue
         usable.append(look)
@@ -156,9 +156,13 @@ def _guides(lens: Float64, pose: Float64, target: Float64, like: Sequence[Guides
     anchors, degree = finest.rows.anchors, max(guides.rows.degree for guides in like)
     # The lattice has a value for every target of the lens; where the pose puts that target is known exactly.
     shown = (np.abs(lens) <= _EXTENT).all(axis=1)
-    before = apply_homography(np.linalg.inv(pose), target)
+    before = apply_homography(_inverse(pose), target)
     near = shown & (np.abs(before) <= 1.3).all(axis=1)
     return fit_guides(lens[near], before[near], anchors, degree)
+
+
+def _inverse(matrix: Float64) -> Float64:
+    return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
 
 
 def _combined(confidence: Float64, share: Float64, count: int) -> float:

@@ -24,9 +24,10 @@ from PIL.TiffImagePlugin import TiffImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
 from unbend_service.adapters.codecs import exif
+from unbend_service.adapters.codecs.cameras import camera_name
 from unbend_service.adapters.codecs.jpegs import decode_luma, decode_rgb, encode_packed
 from unbend_service.adapters.codecs.signatures import announced_size, sniff
-from unbend_service.application.ports import Bytes, DecodedImage, ImageHeader
+from unbend_service.application.ports import Bytes, DecodedImage, ImageHeader, PictureOrigin
 from unbend_service.domain.errors import InvalidFrame, InvalidImage, InvalidOption, TooManyPixels, UnbendError
 from unbend_service.domain.frames import Frame, PixelFormat
 from unbend_service.settings import Settings
@@ -67,6 +68,7 @@ _MAX_JPEG_EXIF_BYTES = 65_533 - 6
 _SHORTEST_DRAFT_PX = 64
 # Half of 1920 is near enough to 1024, and costs far less than the next larger scale.
 _REDUCED_SHARE = 0.9
+_FIRST_TURNED = 5  # EXIF orientations 5 to 8 exchange width and height
 _SUBSAMPLING = "4:2:0"
 _WHITE = (255, 255, 255)
 
@@ -87,6 +89,15 @@ class PillowCodec:
         image_format = sniff(body)
         image = self._open(body, image_format)
         return ImageHeader(image_format, image.width, image.height, _has_alpha(image))
+
+    def origin(self, body: bytes) -> PictureOrigin:
+        """Reads the header only; raises as :meth:`probe`."""
+        image_format = sniff(body)
+        image = self._open(body, image_format)
+        block = exif.bare(image.info.get("exif") or b"") if image_format != "tiff" else b""
+        turned = exif.orientation(block) >= _FIRST_TURNED
+        width, height = (image.height, image.width) if turned else image.size
+        return PictureOrigin(width / height, camera_name(block, width, height) if block else None)
 
     def decode(self, body: bytes) -> DecodedImage:
         """Raises as :meth:`probe`, and InvalidImage for a broken body."""

@@ -30,6 +30,7 @@ class MemoryGridStore:
         entries = settings.grid_store_entries if entries is None else entries
         self._grids = _Recent[GridRecord](entries, settings.grid_store_ttl_s, clock)
         self._streams = _Recent[str](entries, settings.grid_store_ttl_s, clock)
+        self._cameras = _Recent[bytes](entries, settings.grid_store_ttl_s, clock)
         self._claims: dict[str, tuple[str, float]] = {}
         self._clock = clock
 
@@ -72,6 +73,18 @@ class MemoryGridStore:
     async def release_stream(self, stream_id: str, token: str) -> None:
         if self._claims.get(stream_id, ("", 0.0))[0] == token:
             del self._claims[stream_id]
+
+    async def camera(self, name: str) -> bytes | None:
+        return self._cameras.get(name)
+
+    async def swap_camera(self, name: str, known: bytes | None, value: bytes | None) -> bool:
+        if self._cameras.get(name) != known:
+            return False
+        if value is None:
+            self._cameras.remove(name)
+        else:
+            self._cameras.put(name, value)
+        return True
 
     async def close(self) -> None:
         """Nothing is held that could be freed earlier than the store itself."""

@@ -100,6 +100,14 @@ class RedisGridStore:
     async def release_stream(self, stream_id: str, token: str) -> None:
         await self._run(scripts.RELEASE, stream_id, token)
 
+    async def camera(self, name: str) -> bytes | None:
+        found = await self._run(scripts.CAMERA, name)
+        return None if found is None else bytes(found)
+
+    async def swap_camera(self, name: str, known: bytes | None, value: bytes | None) -> bool:
+        arguments = [part for one in (known, value) for part in ((0, b"") if one is None else (1, one))]
+        return bool(await self._run(scripts.SWAP_CAMERA, name, *arguments))
+
     async def close(self) -> None:
         await self._server.aclose()
 
@@ -132,6 +140,8 @@ _SOURCES = (
     scripts.STREAM,
     scripts.CLAIM,
     scripts.RELEASE,
+    scripts.CAMERA,
+    scripts.SWAP_CAMERA,
 )
 
 

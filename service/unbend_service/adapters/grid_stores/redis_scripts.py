@@ -1,7 +1,8 @@
 """What the Redis grid store has the server do in one step.
 
 Keys, all in one hash slot: ``{prefix}:grid:ID`` a packed record, ``{prefix}:stream:ID`` a hash that names its stream
-and grid, ``{prefix}:FAMILY:used`` a sorted set of ids by their last use in microseconds, ``{prefix}:claim:ID`` a token.
+and grid, ``{prefix}:FAMILY:used`` a sorted set of ids by their last use in microseconds, ``{prefix}:claim:ID`` a token,
+``{prefix}:camera:NAME`` what is remembered of a camera.
 Every key expires by itself as well, so that nothing is left behind by replicas that are gone.
 """
 
@@ -128,6 +129,36 @@ RELEASE = (
     + """
 local key = key_of('claim', ARGV[5])
 if redis.call('GET', key) == ARGV[6] then redis.call('DEL', key) end
+return 1
+"""
+)
+
+#: name -> record or nothing
+CAMERA = (
+    _PRELUDE
+    + """
+if not is_kept('camera', ARGV[5]) then return false end
+use('camera', ARGV[5])
+return redis.call('GET', key_of('camera', ARGV[5]))
+"""
+)
+
+#: name, 1 if something is known, that, 1 if something takes its place, that -> whether it was swapped
+SWAP_CAMERA = (
+    _PRELUDE
+    + """
+local found = is_kept('camera', ARGV[5]) and redis.call('GET', key_of('camera', ARGV[5]))
+if ARGV[6] == '1' then
+  if found ~= ARGV[7] then return 0 end
+elseif found then
+  return 0
+end
+if ARGV[8] == '1' then
+  redis.call('SET', key_of('camera', ARGV[5]), ARGV[9])
+  use('camera', ARGV[5])
+else
+  forget('camera', ARGV[5])
+end
 return 1
 """
 )

@@ -111,6 +111,20 @@ class ShelteredGridStore:
             except GridStoreUnavailable as error:
                 self._fail(error)  # the claim lapses by itself
 
+    async def camera(self, name: str) -> bytes | None:
+        """What this replica saw of the camera while it is on its own."""
+        try:
+            return await self._ask("camera", lambda: self._shared.camera(name))
+        except GridStoreUnavailable:
+            return await self._local.camera(name)
+
+    async def swap_camera(self, name: str, known: bytes | None, value: bytes | None) -> bool:
+        """Pictures that are seen during an outage count here, and are not handed in."""
+        try:
+            return await self._ask("camera", lambda: self._shared.swap_camera(name, known, value))
+        except GridStoreUnavailable:
+            return await self._local.swap_camera(name, await self._local.camera(name), value)
+
     async def close(self) -> None:
         if self._mending is not None:
             self._mending.cancel()

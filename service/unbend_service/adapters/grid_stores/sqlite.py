@@ -39,7 +39,11 @@ _CLAIMS = (
     "CREATE TABLE IF NOT EXISTS claims "
     "(stream_id TEXT PRIMARY KEY, token TEXT NOT NULL, expires_at REAL NOT NULL) WITHOUT ROWID"
 )
-_TABLES = ("grids", "streams")
+_CAMERAS = (
+    "CREATE TABLE IF NOT EXISTS cameras "
+    "(id TEXT PRIMARY KEY, record BLOB NOT NULL, used_at REAL NOT NULL) WITHOUT ROWID"
+)
+_TABLES = ("grids", "streams", "cameras")
 _BUSY_TIMEOUT_S = 5.0
 
 
@@ -89,6 +93,11 @@ class SqliteGridStore:
 
     async def release_stream(self, stream_id: str, token: str) -> None:
         await self._run(self._release_stream, stream_id, token)
+    async def camera(self, name: str) -> bytes | None:
+        return await self._run(self._camera, name)
+
+    async def swap_camera(self, name: str, known: bytes | None, value: bytes | None) -> bool:
+        return await self._run(self._swap_camera, name, known, value)
 
     async def close(self) -> None:
         await asyncio.get_running_loop().run_in_executor(self._thread, self._connection.close)
@@ -112,6 +121,7 @@ class SqliteGridStore:
                 version = SCHEMA_VERSION
             if version == SCHEMA_VERSION:
                 connection.execute(_CLAIMS)
+                connection.execute(_CAMERAS)
             connection.execute("COMMIT")
         except sqlite3.Error as error:
             connection.close()
@@ -201,6 +211,22 @@ class SqliteGridStore:
 
     def _release_stream(self, stream_id: str, token: str) -> None:
         self._connection.execute("DELETE FROM claims WHERE stream_id = ? AND token = ?", (stream_id, token))
+
+    def _camera(self, name: str) -> bytes | None:
+        query = "UPDATE cameras SET used_at = ? WHERE id = ? RETURNING record"
+        found = self._connection.execute(query, (self._clock(), name)).fetchall()
+        return found[0][0] if found else None
+
+    def _swap_camera(self, name: str, known: bytes | None, value: bytes | None) -> bool:
+        if self._camera(name) != known:
+            return False
+        if value is None:
+            self._connection.execute("DELETE FROM cameras WHERE id = ?", (name,))
+        else:
+            row = (name, value, self._clock())
+            self._connection.execute("INSERT OR REPLACE INTO cameras VALUES (?, ?, ?)", row)
+            self._bound("cameras")
+        return True
 
     def _forget(self) -> None:
         for table in _TABLES:

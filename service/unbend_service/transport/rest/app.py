@@ -10,7 +10,7 @@ from pydantic.json_schema import models_json_schema
 
 from unbend_service.application.service import Service
 from unbend_service.settings import Settings
-from unbend_service.transport.rest import correct, estimate, exchange, grids, health, overlay, pages, problems
+from unbend_service.transport.rest import cameras, correct, estimate, exchange, grids, health, overlay, pages, problems
 from unbend_service.transport.rest.accounting import Accounting, Admitting
 from unbend_service.transport.rest.bodies import Bodies
 from unbend_service.transport.rest.parameters import refuse_unknown
@@ -38,6 +38,7 @@ def create_app(service: Service, settings: Settings) -> FastAPI:
         estimate.router(service, bodies),
         overlay.router(service, bodies),
         grids.router(service, bodies),
+        cameras.router(service),
         exchange.router(service, bodies),
         health.router(service),
         pages.router(),

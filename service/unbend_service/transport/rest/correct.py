@@ -66,6 +66,7 @@ def router(service: Service, bodies: Bodies) -> APIRouter:
         format: parameters.FormatQuery = None,
         grid_id: parameters.GridIdQuery = None,
         min_confidence: parameters.ConfidenceQuery = None,
+        camera: parameters.CameraQuery = None,
     ) -> Response:
         """Send the image file; the straightened picture comes back in the same format, upright, with its EXIF block
         and ICC profile. A picture that has nothing to correct, or whose estimate is not trusted, is left alone."""
@@ -78,6 +79,7 @@ def router(service: Service, bodies: Bodies) -> APIRouter:
             image_format=format,
             grid_id=grid_id,
             min_confidence=min_confidence,
+            camera=camera,
         )
         async with bodies.image(request) as body:
             corrected = await service.correction.of_image(body, options)

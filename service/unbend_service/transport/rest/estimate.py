@@ -34,12 +34,13 @@ def router(service: Service, bodies: Bodies) -> APIRouter:
         fit: parameters.FitQuery = "keep",
         strength: parameters.StrengthQuery = 1.0,
         min_confidence: parameters.ConfidenceQuery = None,
+        camera: parameters.CameraQuery = None,
     ) -> Response:
         """Send the image file. The grid that comes back, and is stored under `grid_id`, is the one that `correct`,
         `fit` and `strength` describe; the guides are as estimated."""
         wanted = Fit.parse(fit)
         async with bodies.image(request) as body:
-            record = await service.estimation.of_image(body, correct, wanted, strength, min_confidence)
+            record = await service.estimation.of_image(body, correct, wanted, strength, min_confidence, camera)
         return json_of(record)
 
     return routes

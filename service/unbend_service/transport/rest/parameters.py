@@ -60,6 +60,16 @@ GridIdQuery = Annotated[
     str | None,
     Query(min_length=1, max_length=128, description="Id of a stored grid, used instead of an estimate."),
 ]
+CameraQuery = Annotated[
+    str | None,
+    Query(
+        min_length=1,
+        max_length=128,
+        description="Whose picture it is. What pictures of one camera say of its lens adds up, until it is known well "
+        "enough and locks. `exif` takes make, model, lens and focal length from the file, if it names them.",
+    ),
+]
+CameraPath = Annotated[str, Path(max_length=128, description="The name that pictures gave their camera.")]
 GridIdPath = Annotated[str, Path(max_length=128, description="The id that the content gives the grid.")]
 
 

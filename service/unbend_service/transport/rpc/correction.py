@@ -60,7 +60,7 @@ class CorrectionServicer(correction_pb2_grpc.CorrectionServiceServicer):
         layout = to_format(request.format.pixel_format)
         min_confidence = request.min_confidence if request.HasField("min_confidence") else None
         options = to_options(request.correct, request.rendering, min_confidence)
-        options = replace(options, grid_id=request.grid_id or None)
+        options = replace(options, grid_id=request.grid_id or None, camera=request.camera or None)
         if isinstance(layout, PixelFormat):
             if request.answer_format not in (frame_pb2.PIXEL_FORMAT_UNSPECIFIED, request.format.pixel_format):
                 raise InvalidOption("A raw picture comes back in its own format.", allowed="no answer_format")

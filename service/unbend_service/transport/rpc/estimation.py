@@ -31,10 +31,14 @@ class EstimationServicer(estimation_pb2_grpc.EstimationServiceServicer):
         if isinstance(layout, PixelFormat):
             check_pixels(request.format.width, request.format.height, self._settings.source_pixels)
             frame = to_frame(layout, request.format.width, request.format.height, request.data)
-            record = await self._estimation.of_frame(frame, correct, fit, strength, min_confidence)
+            record = await self._estimation.of_frame(
+                frame, correct, fit, strength, min_confidence, request.camera or None
+            )
         else:
             body = check_body(request.data, self._settings.body_bytes)
-            record = await self._estimation.of_image(body, correct, fit, strength, min_confidence)
+            record = await self._estimation.of_image(
+                body, correct, fit, strength, min_confidence, request.camera or None
+            )
         return estimation_pb2.EstimateResponse(record=from_record(record, whole=True))
 
     async def EstimateGuides(  # noqa: N802 as above
