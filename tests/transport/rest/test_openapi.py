@@ -34,6 +34,8 @@ async def test_the_calls_of_the_design_are_there(document: dict[str, Any]) -> No
         "PUT /v1/grids/{grid_id}",
         "DELETE /v1/grids/{grid_id}",
         "GET /v1/grids/{grid_id}/export",
+        "GET /v1/cameras/{name}",
+        "DELETE /v1/cameras/{name}",
         "GET /livez",
         "GET /readyz",
         "GET /metrics",
