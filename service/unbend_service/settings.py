@@ -42,6 +42,12 @@ class Settings(BaseSettings):
     )
     queue_frames: int = Field(64, ge=1, description="Frames that may wait for a renderer; one more is refused.")
     render_deadline_s: float = Field(30.0, gt=0, description="Longest time from acceptance to answer of one frame.")
+    hang_s: float = Field(
+        10.0,
+        gt=0,
+        description="A worker that draws one frame for longer is replaced, and the frame drawn by another; at most the "
+        "render deadline.",
+    )
 
     local_socket: Path | None = Field(
         None,

@@ -6,6 +6,8 @@ import math
 import os
 from pathlib import Path
 
+from unbend_service.adapters.control_groups import control_groups, read
+
 
 def usable_cores(root: Path = Path("/")) -> int:
     """Cores that the scheduler lets us use: the affinity mask, and the CPU quota of the control group (v2 or v1).
@@ -20,30 +22,12 @@ def usable_cores(root: Path = Path("/")) -> int:
 
 def _quotas(root: Path) -> list[float]:
     """Every CPU limit, in cores, on the way from our control group up to the root of what we see."""
-    mount = root / "sys/fs/cgroup"
     quotas = []
-    for line in _read(root / "proc/self/cgroup").splitlines():
-        _, controllers, group = line.split(":", 2)
-        if controllers == "":
-            for directory in _upwards(mount, group):
-                limit = _read(directory / "cpu.max").split()
-                if len(limit) == 2 and limit[0] != "max":
-                    quotas.append(int(limit[0]) / int(limit[1]))
-        elif "cpu" in controllers.split(","):
-            for directory in _upwards(mount / "cpu", group):
-                quota, period = _read(directory / "cpu.cfs_quota_us"), _read(directory / "cpu.cfs_period_us")
-                if quota and period and int(quota) > 0:
-                    quotas.append(int(quota) / int(period))
+    for directory in control_groups("cpu", root):
+        limit = read(directory / "cpu.max").split()
+        if len(limit) == 2 and limit[0] != "max":
+            quotas.append(int(limit[0]) / int(limit[1]))
+        quota, period = read(directory / "cpu.cfs_quota_us"), read(directory / "cpu.cfs_period_us")
+        if quota and period and int(quota) > 0:
+            quotas.append(int(quota) / int(period))
     return quotas
-
-
-def _upwards(mount: Path, group: str) -> list[Path]:
-    own = mount / group.strip("/")
-    return [own, *(parent for parent in own.parents if parent.is_relative_to(mount))]
-
-
-def _read(path: Path) -> str:
-    try:
-        return path.read_text().strip()
-    except OSError:
-        return ""

@@ -14,7 +14,7 @@ from unbend_service.domain.errors import RendererUnavailable
 from unbend_service.domain.frames import Border, Frame
 from unbend_service.domain.grid import Grid
 
-DRAW, SLEEP, CRASH, KILLED_TWICE, KILLED, HANG, RAISE, WHO = range(8)
+DRAW, SLEEP, CRASH, KILLED_TWICE, KILLED, HANG, RAISE, WHO, STOPPED_ONCE, LOST, LOST_ONCE = range(11)
 SLEEP_S = 0.5
 
 
@@ -39,6 +39,10 @@ class MisbehavingRenderer:
             os.kill(os.getpid(), signal.SIGKILL)
         elif order == HANG:
             time.sleep(3600)
+        elif order == STOPPED_ONCE and times_before() < 1:
+            os.kill(os.getpid(), signal.SIGSTOP)
+        elif order == LOST or (order == LOST_ONCE and times_before() < 1):
+            raise RendererUnavailable("The OpenGL context is lost.")
         elif order == RAISE:
             raise ValueError("a renderer that fails")
         elif order == WHO:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import ctypes
 import os
 
 import numpy as np
@@ -37,6 +38,25 @@ def test_a_process_has_one_context_and_may_open_another_after_it() -> None:
         np.testing.assert_array_equal(target, frame.data)
         renderer.close()
         renderer.close()
+
+
+def test_a_lost_context_is_noticed_though_nothing_reports_it() -> None:
+    """Without a context the driver draws nothing and says nothing: no stale picture is taken for an answer."""
+    renderer = opened()
+    frame = Frame(PixelFormat.GRAY8, 64, 48, np.random.default_rng(1).integers(0, 256, 64 * 48, np.uint8))
+    target = np.empty_like(frame.data)
+    renderer.render(frame, Grid.identity(), BLACK, target)
+    egl = ctypes.CDLL("libEGL.so.1")
+    for name in ("eglGetCurrentDisplay", "eglGetCurrentContext"):
+        getattr(egl, name).restype = ctypes.c_void_p
+    display, context = (ctypes.c_void_p(egl.eglGetCurrentDisplay()), ctypes.c_void_p(egl.eglGetCurrentContext()))
+    assert egl.eglMakeCurrent(display, None, None, None)
+    with pytest.raises(RendererUnavailable, match=r"context .* is lost"):
+        renderer.render(frame, Grid.identity(), BLACK, target)
+    assert egl.eglMakeCurrent(display, None, None, context)
+    renderer.render(frame, Grid.identity(), BLACK, target)
+    np.testing.assert_array_equal(target, frame.data)
+    renderer.close()
 
 
 def test_a_software_device_is_not_taken_for_a_gpu() -> None:

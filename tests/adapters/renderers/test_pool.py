@@ -122,7 +122,7 @@ async def test_no_worker_idles_while_a_frame_waits(make_pool: MakePool) -> None:
     assert min(shares.values()) >= 4
 
 
-async def test_a_full_queue_refuses_at_once(make_pool: MakePool) -> None:
+async def test_a_full_queue_refuses_at_once(make_pool: MakePool, meter: RecordingMeter) -> None:
     """One frame too many is refused with the setting's name and when to come back; the accepted ones are rendered."""
     pool = await make_pool(queue_frames=2, slots_per_worker=1)
     accepted = [asyncio.create_task(pool.render(frame(misbehaving.SLEEP), GRID, BLACK)) for _ in range(3)]
@@ -132,6 +132,7 @@ async def test_a_full_queue_refuses_at_once(make_pool: MakePool) -> None:
         await pool.render(frame(misbehaving.DRAW), GRID, BLACK)
     assert refusal.value.retry_after_s is not None
     assert refusal.value.retry_after_s > 0
+    assert meter.rejections == {"queue_full": 1}
     assert len(await asyncio.gather(*accepted)) == 3
 
 
@@ -180,6 +181,83 @@ async def test_a_stopped_worker_is_replaced(make_pool: MakePool, meter: Recordin
     with pytest.raises(DeadlineExceeded):
         await pool.render(frame(misbehaving.DRAW), GRID, BLACK)
     await until(lambda: meter.restarts["hung"] == 1 and pool.state().ready)
+
+
+async def test_a_frame_whose_worker_is_stopped_is_rendered_by_the_next(
+    make_pool: MakePool, meter: RecordingMeter
+) -> None:
+    """SIGSTOP in the middle of a frame: after hang_s the worker is replaced, and the caller gets his picture."""
+    pool = await make_pool(hang_s=0.5)
+    stopped = pool.state().workers[0].pid
+    source = frame(misbehaving.STOPPED_ONCE)
+    np.testing.assert_array_equal(await pool.render(source, GRID, BLACK), expected(source))
+    assert meter.restarts == {"hung": 1}
+    assert stopped not in {process.pid for process in worker_processes()}
+
+
+async def test_a_frame_that_hangs_two_workers_is_poison(make_pool: MakePool, meter: RecordingMeter) -> None:
+    """A frame that no worker gets done with is given up before its deadline."""
+    pool = await make_pool(hang_s=0.5)
+    with pytest.raises(PoisonFrame):
+        await pool.render(frame(misbehaving.HANG), GRID, BLACK)
+    assert meter.restarts == {"hung": 2}
+
+
+async def test_a_poisonous_frame_is_kept_out(make_pool: MakePool, meter: RecordingMeter) -> None:
+    """Sent again, it is refused at once and costs no further worker; frames like it are rendered."""
+    pool = await make_pool()
+    for _ in range(3):
+        with pytest.raises(PoisonFrame):
+            await pool.render(frame(misbehaving.CRASH), GRID, BLACK)
+    assert meter.restarts == {"died": 2}
+    assert meter.rejections == {"poison_frame": 2}
+    with pytest.raises(PoisonFrame, match="worker died"):
+        await pool.render(frame(misbehaving.CRASH, seed=1), GRID, BLACK)
+
+
+async def test_a_renderer_that_is_lost_costs_no_frame(make_pool: MakePool, meter: RecordingMeter) -> None:
+    """A worker whose OpenGL context is gone says so and is replaced, and the frame is drawn by the next."""
+    pool = await make_pool()
+    source = frame(misbehaving.LOST_ONCE)
+    np.testing.assert_array_equal(await pool.render(source, GRID, BLACK), expected(source))
+    assert meter.restarts == {"renderer_lost": 1}
+    with pytest.raises(PoisonFrame):
+        await pool.render(frame(misbehaving.LOST), GRID, BLACK)
+
+
+async def test_many_crashes_within_a_minute_make_the_pool_unready(make_pool: MakePool, meter: RecordingMeter) -> None:
+    """The fifth crash of a minute flips readiness, with the reason; frames that come all the same are rendered."""
+    pool = await make_pool()
+    for seed in range(2):
+        with pytest.raises(PoisonFrame):
+            await pool.render(frame(misbehaving.CRASH, seed), GRID, BLACK)
+    await until(lambda: pool.state().ready)
+    with pytest.raises(PoisonFrame):
+        await pool.render(frame(misbehaving.CRASH, 2), GRID, BLACK)
+    await until(lambda: pool.state().workers[0].state == "ready")
+    state = pool.state()
+    assert not state.ready
+    assert state.reason == "6 render workers died within 60 s, the last one: died, exit status 70."
+    np.testing.assert_array_equal(
+        await pool.render(frame(misbehaving.DRAW), GRID, BLACK), expected(frame(misbehaving.DRAW))
+    )
+
+
+async def test_workers_killed_from_outside_are_no_storm(make_pool: MakePool, meter: RecordingMeter) -> None:
+    """Whoever kills sound workers one after the other does not take the service off the net."""
+    pool = await make_pool()
+    for kills in range(1, 7):
+        await pool.render(frame(misbehaving.DRAW), GRID, BLACK)
+        os.kill(pool.state().workers[0].pid or 0, signal.SIGKILL)
+        await until(lambda kills=kills: meter.restarts["died"] == kills and pool.state().ready)
+    assert pool.state().ready
+
+
+async def test_more_memory_for_frames_than_there_is_is_refused_at_start(make_pool: MakePool) -> None:
+    """The error names the setting and what would be allowed, before any worker is started."""
+    with pytest.raises(RendererUnavailable, match=r"Allowed: up to \d+ bytes.*Setting: shared_memory_bytes"):
+        await make_pool(shared_memory_bytes=1 << 50)
+    assert worker_processes() == []
 
 
 async def test_cancelling_frees_queue_and_slots(make_pool: MakePool) -> None:

@@ -97,7 +97,7 @@ class Done:
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """From a worker: a task could not be done; without a task, it got no renderer and ends."""
+    """From a worker: a task could not be done; without a task, it got no renderer or lost it, and ends."""
 
     task: int | None
     error: UnbendError

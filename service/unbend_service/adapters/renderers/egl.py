@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -13,11 +14,12 @@ from unbend_service.adapters.renderers.recent import Recent
 from unbend_service.adapters.renderers.sampling import PlaneSampling
 from unbend_service.application.ports import Bytes, RendererInfo
 from unbend_service.domain.errors import InvalidFrame, RendererUnavailable, RenderFailed
-from unbend_service.domain.frames import Border, Frame, Plane, planes
+from unbend_service.domain.frames import BLACK, Border, Frame, PixelFormat, Plane, planes
 from unbend_service.domain.grid import Grid
 
 _SOFTWARE = ("llvmpipe", "softpipe", "swiftshader", "swrast", "basic render")
 _GL_DITHER = 0x0BD0
+_MARK_BYTES = 16
 _REMEDY = (
     "Install libegl1 and a driver (Mesa: libgl1-mesa-dri; NVIDIA in a container: NVIDIA_DRIVER_CAPABILITIES with "
     "graphics), or set UNBEND_RENDERER=cpu"
@@ -95,6 +97,10 @@ class _Mesh:
 class EglRenderer:
     """Renders with OpenGL 3.3 core on an EGL device; the only place where a context is made, one per process.
 
+    A context can be lost: the driver was reset, or the device is gone. Not every driver says so; some draw nothing
+    from then on. So each frame must change a mark that was put into its target, and where it does not, or OpenGL
+    reports an error, a small picture is drawn whose outcome is known.
+
     Cost of a frame: each plane is uploaded, drawn in one pass and read back; a new grid costs its mesh, a new size its
     texture and framebuffer.
 
@@ -129,6 +135,7 @@ class EglRenderer:
         self._surfaces: Recent[tuple[int, int, int], _Surface] = Recent(cache_bytes, _Surface.release)
         self._meshes: Recent[str, _Mesh] = Recent(cache_bytes, _Mesh.release)
         self._info = self._describe()
+        self._mark = np.frombuffer(os.urandom(_MARK_BYTES), np.uint8)
         self._closed = False
         EglRenderer._open = True
 
@@ -151,12 +158,25 @@ class EglRenderer:
         Raises:
             InvalidFrame: a side is longer than the device can draw.
             RenderFailed: OpenGL reported an error.
+            RendererUnavailable: the context is lost, and this renderer with it.
         """
         if max(source.width, source.height) > self._longest_px:
             raise InvalidFrame(
                 f"A frame of {source.width}x{source.height} pixels is too large for {self._info.device}.",
                 allowed=f"1 to {self._longest_px} pixels on a side",
             )
+        mark = target[-_MARK_BYTES:]
+        mark[:] = self._mark[: mark.size]
+        failure = self._render(source, grid, border, target)
+        untouched = np.array_equal(mark, self._mark[: mark.size])
+        if failure or untouched:
+            if not self._draws():
+                raise RendererUnavailable(f"The OpenGL context on {self._info.device} is lost. {failure}".rstrip())
+            if failure:
+                raise RenderFailed(failure)
+
+    def _render(self, source: Frame, grid: Grid, border: Border, target: Bytes) -> str:
+        """Draws; returns what OpenGL had to say against it, if anything."""
         colours = border.samples(source.pixel_format)
         layout = planes(source.pixel_format, source.width, source.height)
         try:
@@ -167,9 +187,18 @@ class EglRenderer:
                 bordered = not sampling.shows_only_source(grid)
                 self._draw(plane, sampling, mesh, colour, bordered, source.data[part], target[part])
         except moderngl.Error as error:
-            raise RenderFailed(f"OpenGL could not render the frame: {error}") from error
-        if (code := self._context.error) != "GL_NO_ERROR":
-            raise RenderFailed(f"OpenGL reported {code}.")
+            return f"OpenGL could not render the frame: {error}"
+        code = self._context.error
+        return "" if code == "GL_NO_ERROR" else f"OpenGL reported {code}."
+
+    def _draws(self) -> bool:
+        """Whether the context still draws: two small pictures, so that no leftover of the one passes for the other."""
+        for level in (85, 170):
+            picture = Frame(PixelFormat.GRAY8, 16, 16, np.full(256, level, np.uint8))
+            drawn = np.zeros(256, np.uint8)
+            if self._render(picture, Grid.identity(2, 2), BLACK, drawn) or not (drawn == level).all():
+                return False
+        return True
 
     def _draw(
         self,

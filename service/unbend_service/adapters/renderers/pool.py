@@ -9,10 +9,12 @@ import numpy as np
 import structlog
 
 from unbend_service.adapters.cores import usable_cores
+from unbend_service.adapters.memory import check_shared_memory, memory_limit_bytes
 from unbend_service.adapters.renderers.channel import Done, Failed
 from unbend_service.adapters.renderers.copies import Copies
 from unbend_service.adapters.renderers.jobs import Job, JobQueue, preferred_worker
 from unbend_service.adapters.renderers.leases import Lending
+from unbend_service.adapters.renderers.quarantine import Quarantine
 from unbend_service.adapters.renderers.regions import Region, RegionKeeper
 from unbend_service.adapters.renderers.selection import RendererOptions
 from unbend_service.adapters.renderers.slots import SlotPool
@@ -36,7 +38,8 @@ log = structlog.get_logger(__name__)
 DEFAULT_FACTORY = "unbend_service.adapters.renderers.selection:open_renderer"
 #: A GPU gains little from more processes than keep it fed, and each holds a context and textures of its own.
 _WORKERS_OF_A_GPU = 4
-#: Two crashes make a frame poison. A SIGKILL comes from outside and says less of the frame, unless it comes every time.
+#: Two crashes or hangs make a frame poison. A SIGKILL comes from outside and says less of the frame, unless it comes
+#: every time.
 _BLAME_OF_A_CRASH, _BLAME_OF_A_KILL, _BLAME_OF_POISON = 2, 1, 4
 _METER_INTERVAL_S = 0.1
 
@@ -51,7 +54,7 @@ class WorkerPool:
     two short messages. A frame in the memory of a client is drawn there, without any copy.
 
     Args:
-        settings: workers, slots_per_worker, shared_memory_bytes, queue_frames, render_deadline_s, renderer,
+        settings: workers, slots_per_worker, shared_memory_bytes, queue_frames, render_deadline_s, hang_s, renderer,
             require_gpu, egl_device, map_cache_bytes are used.
         meter: told of restarts, stages and the pool's state.
         renderer_factory: ``module:callable`` that makes the renderer, in the worker, from RendererOptions.
@@ -78,15 +81,19 @@ class WorkerPool:
             egl_device=settings.egl_device,
             map_cache_bytes=settings.map_cache_bytes,
         )
-        self._supervisor = Supervisor(renderer_factory, options, settings.render_deadline_s, self)
+        self._quarantine = Quarantine()
+        hang_s = min(settings.hang_s, settings.render_deadline_s)
+        self._supervisor = Supervisor(renderer_factory, options, hang_s, self)
         self._regions = RegionKeeper(self._slots.next_number, self._supervisor.unmap)
 
     async def start(self) -> None:
         """Starts one worker, learns from it what the renderer is, and then starts the others.
 
         Raises:
-            RendererUnavailable: it could not be started, or a GPU is required and missing.
+            RendererUnavailable: it could not be started, a GPU is required and missing, or the memory for frames is
+                more than there is.
         """
+        check_shared_memory(self._settings.shared_memory_bytes, memory_limit_bytes())
         try:
             info = await self._supervisor.start_first()
         except BaseException:
@@ -115,6 +122,9 @@ class WorkerPool:
         loop = asyncio.get_running_loop()
         limit_s = min(self._settings.render_deadline_s, math.inf if deadline_s is None else deadline_s)
         self._check_accepting(limit_s)
+        if self._quarantine.holds(frame, grid, border):
+            self._meter.rejected(PoisonFrame.code)
+            raise PoisonFrame("Workers died of this very frame a short while ago.")
         region: Region | None = None
         if shared is not None:
             region = self._regions.known(shared.memory)
@@ -166,6 +176,7 @@ class WorkerPool:
             raise RendererUnavailable(self._supervisor.reason, retry_after_s=1.0)
         if len(self._queue) >= self._settings.queue_frames:
             expected_s = len(self._queue) * self._mean_render_s / max(1, self._supervisor.count)
+            self._meter.rejected(QueueFull.code)
             raise QueueFull(
                 f"{len(self._queue)} frames wait for a renderer already.",
                 setting="queue_frames",
@@ -254,6 +265,7 @@ class WorkerPool:
             if job is culprit:
                 job.blame += _BLAME_OF_A_KILL if killed else _BLAME_OF_A_CRASH
             if job.blame >= _BLAME_OF_POISON:
+                self._quarantine.add(job.frame, job.grid, job.border)
                 _settle(job, PoisonFrame("Worker after worker died while it rendered this frame."))
             if not job.copied:
                 continue  # the copy is under way, and what follows it sees that the worker is gone

@@ -13,6 +13,7 @@ import structlog
 from unbend_service.adapters.renderers.channel import Done, Failed, Ready
 from unbend_service.adapters.renderers.jobs import Job
 from unbend_service.adapters.renderers.selection import RendererOptions
+from unbend_service.adapters.renderers.storms import StormGuard
 from unbend_service.adapters.renderers.worker_process import WorkerProcess
 from unbend_service.application.ports import RendererInfo, WorkerState
 from unbend_service.domain.errors import RendererUnavailable
@@ -95,6 +96,7 @@ class Supervisor:
         self._places: list[_Place] = []
         self._first: asyncio.Future[RendererInfo] | None = None
         self._reaping: set[asyncio.Task[int]] = set()
+        self._storm = StormGuard()
         self._last_error = ""
         self._closed = False
         self.info: RendererInfo | None = None
@@ -114,9 +116,12 @@ class Supervisor:
 
     @property
     def reason(self) -> str:
-        """Why no worker can take a frame, in one sentence; empty if one can."""
+        """Why frames had better not be sent here, in one sentence; empty if they can be.
+
+        In a storm that is so although some worker may live: whoever sends a frame all the same may be lucky.
+        """
         if self.ready():
-            return ""
+            return self._storm.reason(asyncio.get_running_loop().time())
         if not self._places:
             return "The renderers were not started."
         if self.broken:
@@ -190,6 +195,7 @@ class Supervisor:
             place.worker = WorkerProcess(place.index, self._factory, self._options, loop.time())
         except OSError as error:
             self._last_error = f"{type(error).__name__}: {error}"
+            self._storm.note(loop.time(), self._last_error)
             self._retry(place, "start_failed")
             return
         loop.add_reader(place.worker.channel.fileno(), self._read, place, place.worker)
@@ -210,6 +216,9 @@ class Supervisor:
             elif isinstance(message, Failed) and message.task is None:
                 worker.refused = True
                 self._on_refusal(message)
+                if worker.info is not None:
+                    place.verdict = "renderer_lost"
+                    worker.kill()
             else:
                 self._listener.on_answer(worker, message)
                 place.stop_timer()
@@ -225,7 +234,7 @@ class Supervisor:
             self._first.set_result(info)
 
     def _on_refusal(self, refusal: Failed) -> None:
-        """The worker said itself why it cannot start; trying again at once would not help the first."""
+        """The worker said itself why it cannot start, or go on; trying again at once would not help the first."""
         self._last_error = str(refusal.error)
         if self._first is not None and not self._first.done():
             self._first.set_exception(refusal.error)
@@ -247,11 +256,15 @@ class Supervisor:
         self._release(worker)
         ready = worker.info is not None
         reason = place.verdict or ("died" if ready else "start_failed")
-        lived_s = asyncio.get_running_loop().time() - worker.started_s
-        if ready and (worker.rendered or worker.sent or lived_s > _SOUND_LIFE_S):
+        killed = status == -signal.SIGKILL and not place.verdict
+        now_s = asyncio.get_running_loop().time()
+        sound = ready and (worker.rendered > 0 or bool(worker.sent) or now_s - worker.started_s > _SOUND_LIFE_S)
+        if sound:
             place.failures = -1
         elif not worker.refused:
             self._last_error = f"exit status {status}" if reason == "start_failed" else reason
+        if not (killed and sound):
+            self._storm.note(now_s, f"{reason.replace('_', ' ')}, exit status {status}")
         log.warning(
             "render worker gone",
             worker=place.index,
@@ -260,7 +273,7 @@ class Supervisor:
             exit_status=status,
             frames=len(worker.held),
         )
-        self._listener.on_death(worker, killed=status == -signal.SIGKILL)
+        self._listener.on_death(worker, killed)
         self._retry(place, reason)
 
     def _retry(self, place: _Place, reason: str) -> None:
@@ -273,11 +286,14 @@ class Supervisor:
             self._listener.on_broken(self.reason)
         place.restarts += 1
         self._listener.on_restart(reason)
-        if place.failures <= 0:
+        loop = asyncio.get_running_loop()
+        backoff_s = self._storm.backoff_s(loop.time())
+        if place.failures > 0:
+            backoff_s = max(backoff_s, min(_LONGEST_BACKOFF_S, 0.1 * 2**place.failures))
+        if backoff_s:
+            place.timer = loop.call_later(backoff_s, self._launch, place)
+        else:
             self._launch(place)
-            return
-        backoff_s = min(_LONGEST_BACKOFF_S, 0.1 * 2**place.failures)
-        place.timer = asyncio.get_running_loop().call_later(backoff_s, self._launch, place)
 
     def _release(self, worker: WorkerProcess) -> None:
         """Closes the channel, at which an idle worker ends, and waits for the end of the process off the loop."""

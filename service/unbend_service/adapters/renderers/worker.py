@@ -49,7 +49,12 @@ class Worker:
         self._failures = 0
 
     def serve(self) -> None:
-        """Works until the renderer fails again and again; raises EOFError or ConnectionError when the parent goes."""
+        """Works until the renderer fails again and again.
+
+        Raises:
+            RendererUnavailable: it was lost. The frame is not answered, so that another worker draws it.
+            EOFError, ConnectionError: the parent has gone.
+        """
         while self._failures < _FAILURES_IN_A_ROW:
             message, fd = self._channel.receive()
             if isinstance(message, MapSlot) and fd is not None:
@@ -66,6 +71,8 @@ class Worker:
             self._render(task)
         except InvalidInput as error:
             return Failed(task.number, error)
+        except RendererUnavailable:
+            raise
         except Exception as error:
             self._failures += 1
             return Failed(task.number, _as_unbend_error(error))
@@ -134,8 +141,13 @@ def _serve(channel: Channel, begin: Begin) -> int:
     try:
         channel.send(Ready(renderer.info))
         Worker(channel, renderer).serve()
-    finally:
+    except RendererUnavailable as error:
+        channel.send(Failed(None, error))
+        return 1  # what is left of the renderer goes with the process: to free it might hang
+    except (EOFError, ConnectionError):
         renderer.close()
+        raise
+    renderer.close()
     return 0
 
 

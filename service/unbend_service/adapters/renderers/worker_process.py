@@ -28,7 +28,7 @@ class WorkerProcess:
     Attributes:
         index: place in the pool; the process that replaces a dead one has the same.
         info: its renderer, None until it is ready.
-        refused: whether it said why it can have no renderer.
+        refused: whether it said why it has no renderer, or none any more.
         held: jobs that were assigned to it.
         sent: jobs that it knows of, in its order of work; the first is the one it renders.
         rendered: frames it has answered.
