@@ -103,3 +103,18 @@ evaluate: $(VENV)/.training  ## Print the accuracy tables of the default model o
 	$(TRAINING) evaluate --weights service/unbend_service/models/lineset.onnx --limit 150 --threshold 0.8
 
 .PHONY: train train-smoke export evaluate
+
+CHAOS_S ?= 600
+SOAK_S ?= 3600
+OVERLOAD_S ?= 60
+
+chaos: setup-dev  ## Kill, stop and crash render workers under ten streams for CHAOS_S seconds
+	$(BIN)/python -m tests.endurance chaos --seconds $(CHAOS_S)
+
+soak: setup-dev  ## Mixed work for SOAK_S seconds, a tenth given up; what was taken has to come back
+	$(BIN)/python -m tests.endurance soak --seconds $(SOAK_S)
+
+overload: setup-dev  ## Three times the work that fits, for OVERLOAD_S seconds
+	$(BIN)/python -m tests.endurance overload --seconds $(OVERLOAD_S)
+
+.PHONY: chaos soak overload

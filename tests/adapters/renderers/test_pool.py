@@ -289,6 +289,15 @@ async def test_memory_is_bounded_and_its_setting_named(make_pool: MakePool) -> N
         await pool.render(frame(misbehaving.DRAW, 0, 1920, 1080), GRID, BLACK)
 
 
+async def test_a_pool_at_rest_holds_no_memory_for_frames(make_pool: MakePool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a burst needed goes back to the system once it is over, and comes again with the next."""
+    monkeypatch.setattr("unbend_service.adapters.renderers.pool._REST_S", 0.05)
+    pool = await make_pool()
+    for _ in range(2):
+        await asyncio.gather(*(pool.render(frame(misbehaving.DRAW, n), GRID, BLACK) for n in range(4)))
+        await until(lambda: slot_descriptors() == 0)
+
+
 async def test_a_renderer_that_fails_is_an_error_and_then_replaced(make_pool: MakePool, meter: RecordingMeter) -> None:
     """One failure is the frame's error; failures in a row are the worker's, and it is replaced."""
     pool = await make_pool()

@@ -42,6 +42,8 @@ _WORKERS_OF_A_GPU = 4
 #: every time.
 _BLAME_OF_A_CRASH, _BLAME_OF_A_KILL, _BLAME_OF_POISON = 2, 1, 4
 _METER_INTERVAL_S = 0.1
+#: Memory for frames is given back once no frame came for so long.
+_REST_S = 10.0
 
 
 class WorkerPool:
@@ -72,6 +74,7 @@ class WorkerPool:
         self._closed = False
         self._done_all = asyncio.Event()
         self._meter_timer: asyncio.TimerHandle | None = None
+        self._rest_timer: asyncio.TimerHandle | None = None
         self._copies = Copies()
         self._cores = usable_cores()
         options = RendererOptions(
@@ -143,6 +146,9 @@ class WorkerPool:
             copied=shared is not None,
         )
         self._jobs.add(job)
+        if self._rest_timer is not None:
+            self._rest_timer.cancel()
+            self._rest_timer = None
         self._queue.append(job)
         self._dispatch()
         try:
@@ -216,8 +222,9 @@ class WorkerPool:
             self._jobs.clear()
             self._slots.close()
             self._regions.close()
-            if self._meter_timer is not None:
-                self._meter_timer.cancel()
+            for timer in (self._meter_timer, self._rest_timer):
+                if timer is not None:
+                    timer.cancel()
             self._meter.pool(self.state())
 
     def _dispatch(self) -> None:
@@ -363,6 +370,13 @@ class WorkerPool:
         self._jobs.discard(job)
         if not self._jobs:
             self._done_all.set()
+            if self._rest_timer is None and not self._closed:
+                self._rest_timer = asyncio.get_running_loop().call_later(_REST_S, self._rest)
+
+    def _rest(self) -> None:
+        self._rest_timer = None
+        self._slots.drop_free()
+        self._supervisor.unmap(self._slots.take_dropped())
 
 
 def _settle(job: Job, error: UnbendError) -> None:

@@ -125,6 +125,11 @@ class SlotPool:
         """Makes the slot free for the next frame."""
         self._free[slot.number] = self._used.pop(slot.number)
 
+    def drop_free(self) -> None:
+        """Gives the memory of all free slots back."""
+        while self._free:
+            self._drop(self._free.popitem()[1])
+
     def take_dropped(self) -> list[int]:
         """Numbers of the slots that went since the last call, for the workers to unmap."""
         dropped, self._dropped = self._dropped, []
