@@ -40,7 +40,12 @@ class Settings(BaseSettings):
     shared_memory_bytes: int = Field(
         1 << 30, ge=1 << 20, description="Upper bound of the shared memory for frames under way."
     )
-    queue_frames: int = Field(64, ge=1, description="Frames that may wait for a renderer; one more is refused.")
+    queue_frames: int = Field(
+        64,
+        ge=2,
+        description="Frames that may be under way: half of them single calls, one more of which is refused at once, "
+        "half of streams, which wait.",
+    )
     render_deadline_s: float = Field(30.0, gt=0, description="Longest time from acceptance to answer of one frame.")
     hang_s: float = Field(
         10.0,

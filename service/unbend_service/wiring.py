@@ -17,6 +17,7 @@ from unbend_service.adapters.grid_stores.sqlite import SqliteGridStore
 from unbend_service.adapters.metrics.prometheus import PrometheusMeter
 from unbend_service.adapters.renderers.absent import AbsentPool
 from unbend_service.adapters.renderers.pool import WorkerPool
+from unbend_service.application.admission import Admission
 from unbend_service.application.blocking import BlockingWork
 from unbend_service.application.budget import MemoryBudget
 from unbend_service.application.correction import Correction
@@ -147,6 +148,7 @@ def build_service(settings: Settings, meter: PrometheusMeter | None = None) -> S
         blocking,
         estimator,
         MemoryBudget(settings.bodies_bytes, "bodies_bytes"),
+        admission=Admission(settings.queue_frames - settings.queue_frames // 2),
         role=settings.role,
         closing=closing,
     )

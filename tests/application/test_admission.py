@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from unbend_service.application.admission import Admission
-from unbend_service.domain.errors import Draining
+from unbend_service.domain.errors import Draining, QueueFull
 
 
 async def test_draining_waits_for_calls_under_way_and_refuses_new_ones() -> None:
@@ -33,3 +33,18 @@ async def test_a_drain_that_runs_out_of_time_says_so() -> None:
     admission = Admission()
     with admission.admitted():
         assert not await admission.drain(0.01)
+
+
+async def test_one_single_call_too_many_is_refused_at_once_and_streams_are_not_counted() -> None:
+    """The refusal names the setting and says when to come back; a place that was left is taken by the next."""
+    admission = Admission(2)
+    with admission.admitted(), admission.admitted(single=True):
+        with admission.admitted(single=True):
+            with pytest.raises(QueueFull) as refused, admission.admitted(single=True):
+                pass
+            assert refused.value.setting == "queue_frames"
+            assert refused.value.retry_after_s
+            with admission.admitted():
+                assert admission.active == 4
+        with admission.admitted(single=True):
+            assert admission.active == 3

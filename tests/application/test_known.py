@@ -53,6 +53,21 @@ async def test_who_goes_away_takes_nothing_from_the_others() -> None:
     assert compute.asked == 1
 
 
+async def test_the_last_who_goes_away_ends_the_computation() -> None:
+    """Nothing is computed for nobody; who asks later has it computed anew."""
+    known: Known[int] = Known(1)
+    compute = Computation()
+    asking = [asyncio.create_task(known.get(b"a", compute)) for _ in range(2)]
+    await asyncio.sleep(0)
+    for task in asking:
+        task.cancel()
+    await asyncio.gather(*asking, return_exceptions=True)
+    await asyncio.sleep(0)
+    assert len(asyncio.all_tasks()) == 1
+    compute.may_answer.set()
+    assert await known.get(b"a", compute) == 2
+
+
 async def test_an_error_reaches_all_and_is_forgotten() -> None:
     """Nobody is told an old error: the next one who asks has it tried again."""
     known: Known[int] = Known(1)

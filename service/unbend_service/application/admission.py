@@ -1,4 +1,4 @@
-"""Who is let in: nobody once the service drains."""
+"""Who is let in: nobody once the service drains, and no more single calls at once than it can answer soon."""
 
 from __future__ import annotations
 
@@ -6,13 +6,25 @@ import asyncio
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from unbend_service.domain.errors import Draining
+from unbend_service.domain.errors import Draining, QueueFull
+
+_MEAN_OF_CALLS = 0.1
 
 
 class Admission:
-    """Counts the calls under way and refuses new ones while draining."""
+    """Counts the calls under way and refuses new ones while draining.
 
-    def __init__(self) -> None:
+    A single call is refused here, before its picture is looked at, or not at all: what was let in finds room in every
+    queue behind.
+
+    Args:
+        singles: calls for single pictures and grids that may be under way at once; streams are bounded elsewhere.
+    """
+
+    def __init__(self, singles: int = 1 << 30) -> None:
+        self._singles_at_most = singles
+        self._singles = 0
+        self._mean_call_s = 0.1
         self._active = 0
         self._draining = False
         self._idle = asyncio.Event()
@@ -33,16 +45,27 @@ class Admission:
         return self._active
 
     @contextmanager
-    def admitted(self) -> Iterator[None]:
-        """Around one call. Raises Draining."""
+    def admitted(self, *, single: bool = False) -> Iterator[None]:
+        """Around one call. Raises Draining, and QueueFull for one ``single`` call too many."""
         if self._draining:
             raise Draining("The service is shutting down.", retry_after_s=1.0)
+        if single and self._singles >= self._singles_at_most:
+            raise QueueFull(
+                f"{self._singles} calls are under way already.",
+                setting="queue_frames",
+                retry_after_s=round(max(0.1, self._mean_call_s), 1),
+            )
         self._active += 1
+        self._singles += single
         self._idle.clear()
+        start_s = asyncio.get_running_loop().time()
         try:
             yield
         finally:
             self._active -= 1
+            self._singles -= single
+            if single:
+                self._mean_call_s += _MEAN_OF_CALLS * (asyncio.get_running_loop().time() - start_s - self._mean_call_s)
             if not self._active:
                 self._idle.set()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Awaitable, Callable
 from typing import Generic, TypeVar
 
@@ -27,8 +27,8 @@ def digest(*parts: bytes | Bytes) -> bytes:
 class Known(Generic[V]):
     """Values by the digest of what they were computed from; single-flight, and bounded.
 
-    Whoever asks while a value is being computed waits for that one computation. It is not cancelled with those who
-    wait for it. An error reaches all of them and is not kept.
+    Whoever asks while a value is being computed waits for that one computation. It is cancelled with the last who
+    waits for it. An error reaches all of them and is not kept.
 
     Args:
         entries: values that are kept; the least recently asked for goes first. 0 keeps none.
@@ -38,6 +38,7 @@ class Known(Generic[V]):
         self._entries = entries
         self._values: OrderedDict[bytes, V] = OrderedDict()
         self._under_way: dict[bytes, asyncio.Task[V]] = {}
+        self._waiting: Counter[bytes] = Counter()
 
     def __len__(self) -> int:
         return len(self._values)
@@ -52,13 +53,23 @@ class Known(Generic[V]):
             task = asyncio.create_task(self._compute(key, compute))
             self._under_way[key] = task
             task.add_done_callback(_seen)
-        return await asyncio.shield(task)
+        self._waiting[key] += 1
+        try:
+            return await asyncio.shield(task)
+        finally:
+            self._waiting[key] -= 1
+            if not self._waiting[key]:
+                del self._waiting[key]
+                task.cancel()
+                if self._under_way.get(key) is task:
+                    del self._under_way[key]
 
     async def _compute(self, key: bytes, compute: Callable[[], Awaitable[V]]) -> V:
         try:
             value = await compute()
         finally:
-            del self._under_way[key]
+            if self._under_way.get(key) is asyncio.current_task():
+                del self._under_way[key]
         self._values[key] = value
         while len(self._values) > self._entries:
             self._values.popitem(last=False)

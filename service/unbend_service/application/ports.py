@@ -187,7 +187,8 @@ class RenderPool(Protocol):
             shared: where the frame lies, if it lies in the memory of a client: the workers read it there and put the
                 answer into its ``target``, which is returned. However the call ends, nobody writes there afterwards,
                 except when it is cancelled.
-            affinity: frames with the same key prefer the same worker, whose maps and textures are warm.
+            affinity: frames with the same key prefer the same worker, whose maps and textures are warm, and share one
+                turn in the queue.
             deadline_s: seconds from now after which the answer is worthless.
 
         Raises:

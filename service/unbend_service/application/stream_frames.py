@@ -126,7 +126,7 @@ class FrameAnswers:
         bound = self.settings.body_bytes
         if len(body) > bound:
             raise BodyTooLarge(f"A frame of {len(body)} bytes.", allowed=f"{bound} bytes", setting="body_bytes")
-        image = await self.turns.run(lambda: self.blocking.run("decode", self.codec.decode, body))
+        image = await self.turns.run(self.stream_id, lambda: self.blocking.run("decode", self.codec.decode, body))
         if image.image_format != image_format:
             raise InvalidFrame(f"A {image.image_format} file in a stream of {image_format} files.")
         return image
@@ -134,12 +134,15 @@ class FrameAnswers:
     async def _corrected(self, picture: _Picture, grid: Grid) -> bytes | Bytes:
         frame, image, border = picture.frame, picture.image, self.config.options.border
         data = await self.turns.run(
-            lambda: self.correction.draw(frame, grid, border, affinity=self.stream_id, shared=picture.shared)
+            self.stream_id,
+            lambda: self.correction.draw(frame, grid, border, affinity=self.stream_id, shared=picture.shared),
         )
         if image is None:
             return data
         drawn = replace(image, frame=replace(frame, data=data))
-        return await self.turns.run(lambda: self.correction.encode(drawn, drawn.image_format, self.config.options))
+        return await self.turns.run(
+            self.stream_id, lambda: self.correction.encode(drawn, drawn.image_format, self.config.options)
+        )
 
     def _failed(self, frame: StreamFrame, error: UnbendError) -> StreamResult:
         self.meter.frame("failed")

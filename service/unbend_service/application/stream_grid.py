@@ -123,7 +123,7 @@ class StreamGrid:
             self._offered += 1
             try:
                 grey = await self._turns.run(
-                    lambda: self._blocking.run("decode", grey_of_frame, frame, ESTIMATE_LONGEST_PX)
+                    self._stream_id, lambda: self._blocking.run("decode", grey_of_frame, frame, ESTIMATE_LONGEST_PX)
                 )
             except BaseException:
                 self._offered -= 1
@@ -181,7 +181,7 @@ class StreamGrid:
 
     async def _estimate(self, grey: Bytes) -> None:
         if await self._leads():
-            self._estimates.append(await self._turns.run(lambda: self._estimation.of_grey(grey)))
+            self._estimates.append(await self._turns.run(self._stream_id, lambda: self._estimation.of_grey(grey)))
 
     async def _leads(self) -> bool:
         """Whether the estimate is to be made here; else the grid of the session that made it is taken over."""
@@ -199,8 +199,12 @@ class StreamGrid:
 
     async def _decide(self) -> None:
         options = self._config.options
-        combined = await self._blocking.run("grid", fused_estimate, self._estimates)
-        record = await self._estimation.record(combined, options.correct, options.min_confidence)
+        combined = await self._turns.run(
+            self._stream_id, lambda: self._blocking.run("grid", fused_estimate, self._estimates)
+        )
+        record = await self._turns.run(
+            self._stream_id, lambda: self._estimation.record(combined, options.correct, options.min_confidence)
+        )
         self._fix(await self._fit(await self._lead.bind(record, replace=not self._may_be_known)))
 
     def _fix(self, fixed: FixedGrid) -> None:
@@ -210,13 +214,19 @@ class StreamGrid:
     async def _fit(self, record: GridRecord) -> FixedGrid:
         if leaves_alone(record):
             return FixedGrid(record, None)
-        return FixedGrid(record, await self._correction.fitted(record, self._config.options))
+        options = self._config.options
+        return FixedGrid(
+            record, await self._turns.run(self._stream_id, lambda: self._correction.fitted(record, options))
+        )
 
     async def _stored(self, source: StoredGrid) -> GridRecord:
         return await self._store.get(source.grid_id)
 
     async def _drawn(self, source: DrawnGuides) -> GridRecord:
-        grid = await self._blocking.run("grid", spin_grid, source.guides, Correct.ALL, self._settings.grid_points)
+        points = self._settings.grid_points
+        grid = await self._turns.run(
+            self._stream_id, lambda: self._blocking.run("grid", spin_grid, source.guides, Correct.ALL, points)
+        )
         grid.check_unfolded()
         record = GridRecord(grid, source.guides)
         await self._store.put(record)

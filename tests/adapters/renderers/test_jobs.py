@@ -15,7 +15,7 @@ def queue_of(*preferred: int) -> tuple[JobQueue, list[Job]]:
     frame = Frame(PixelFormat.GRAY8, 3, 1, np.zeros(3, np.uint8))
     loop = asyncio.get_running_loop()
     jobs = [
-        Job(number, frame, Grid.identity(), BLACK, worker, 0.0, loop.create_future())
+        Job(number, frame, Grid.identity(), BLACK, None, worker, 0.0, loop.create_future())
         for number, worker in enumerate(preferred)
     ]
     queue = JobQueue()
@@ -74,3 +74,31 @@ async def test_the_lattice_lies_aligned_behind_both_pictures() -> None:
     _, (job,) = queue_of(-1)
     assert job.lattice_offset == 8
     assert job.slot_bytes == 8 + 65 * 65 * 2 * 4
+
+
+async def test_a_greedy_stream_does_not_starve_the_others() -> None:
+    """However many frames one stream has waiting, the next frame of another is behind one of them at most."""
+    loop = asyncio.get_running_loop()
+    queue = JobQueue()
+
+    def put(number: int, flow: str | None, size_px: int = 100) -> None:
+        frame = Frame(PixelFormat.GRAY8, size_px, 1, np.zeros(size_px, np.uint8))
+        queue.append(Job(number, frame, Grid.identity(), BLACK, flow, -1, 0.0, loop.create_future()))
+
+    def take() -> str | None:
+        job, _ = queue.pick({0}, 1)
+        queue.remove(job)
+        return job.flow
+
+    for number in range(8):
+        put(number, "greedy")
+    assert [take(), take()] == ["greedy"] * 2
+    put(8, "modest")
+    put(9, None)
+    assert sorted(str(take()) for _ in range(3)) == ["None", "greedy", "modest"]
+    for number in range(10, 13):
+        put(number, "modest")
+    put(13, "large", size_px=300)
+    order = [str(take()) for _ in range(len(queue))]
+    assert order[:6] == ["modest", "greedy", "modest", "greedy", "modest", "large"]
+    assert set(order[6:]) == {"greedy"}

@@ -22,6 +22,7 @@ class Job:
 
     Attributes:
         number: unlike that of any other job of the pool.
+        flow: whose frame it is; frames of one flow wait for each other, not for those of another. None: its own.
         preferred: index of the worker whose maps and textures are warm for it, -1 if none is.
         accepted_s: loop time of acceptance.
         answer: what the caller waits for; done early when the caller has gone.
@@ -32,12 +33,14 @@ class Job:
         copied: whether the source is in the slot, or need not be.
         blame: grows with every worker that dies while it renders this very frame.
         passed_over: how often a later frame was taken first because it suited the worker.
+        due_bytes: its place in the queue, see JobQueue.
     """
 
     number: int
     frame: Frame
     grid: Grid
     border: Border
+    flow: str | None
     preferred: int
     accepted_s: float
     answer: asyncio.Future[Bytes]
@@ -48,6 +51,7 @@ class Job:
     copied: bool = False
     blame: int = 0
     passed_over: int = 0
+    due_bytes: int = 0
 
     @property
     def size_bytes(self) -> int:
@@ -85,10 +89,16 @@ def preferred_worker(affinity: str | None, workers: int) -> int:
 
 
 class JobQueue:
-    """First in, first out, but a worker may take a job that prefers it from a little further back."""
+    """Fair between flows, first in, first out within one; a worker may take a job that prefers it from further back.
+
+    Fair queueing by bytes: a job is due when its flow, had it an equal share of all that is drawn, would have had it
+    drawn. However much a flow has waiting, a frame of another is never behind more than one of its frames of that size.
+    """
 
     def __init__(self) -> None:
         self._jobs: list[Job] = []
+        self._drawn_bytes = 0
+        self._due_bytes: dict[str, int] = {}
 
     def __len__(self) -> int:
         return len(self._jobs)
@@ -97,7 +107,18 @@ class JobQueue:
         return iter(self._jobs)
 
     def append(self, job: Job) -> None:
-        self._jobs.append(job)
+        """Puts a new job where its flow's turn is."""
+        if not self._jobs:
+            self._drawn_bytes = 0
+            self._due_bytes.clear()
+        last_bytes = 0 if job.flow is None else self._due_bytes.get(job.flow, 0)
+        job.due_bytes = max(self._drawn_bytes, last_bytes) + job.size_bytes
+        if job.flow is not None:
+            self._due_bytes[job.flow] = job.due_bytes
+        place = len(self._jobs)
+        while place and self._jobs[place - 1].due_bytes > job.due_bytes:
+            place -= 1
+        self._jobs.insert(place, job)
 
     def put_first(self, job: Job) -> None:
         """Puts a job back that was already taken once."""
@@ -108,6 +129,7 @@ class JobQueue:
         if job not in self._jobs:
             return False
         self._jobs.remove(job)
+        self._drawn_bytes = max(self._drawn_bytes, job.due_bytes - job.size_bytes)
         return True
 
     def pick(self, able: Collection[int], workers: int) -> tuple[Job, int | None]:

@@ -138,6 +138,7 @@ class WorkerPool:
             frame=frame,
             grid=grid,
             border=border,
+            flow=affinity,
             preferred=preferred_worker(affinity, self._supervisor.count),
             accepted_s=loop.time(),
             answer=loop.create_future(),

@@ -10,9 +10,7 @@ import structlog
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from unbend_service.application.admission import Admission
 from unbend_service.application.ports import Meter
-from unbend_service.domain.errors import Draining
 from unbend_service.transport.rest import problems
 
 REQUEST_ID_HEADER = "X-Request-Id"
@@ -73,26 +71,6 @@ class Accounting:
             seconds=round(seconds, 4),
             client=(scope.get("client") or ("",))[0],
         )
-
-
-class Admitting:
-    """ASGI middleware: calls of the API are let in one by one, so that a draining service can refuse new ones."""
-
-    def __init__(self, app: ASGIApp, admission: Admission, meter: Meter) -> None:
-        self._app = app
-        self._admission = admission
-        self._meter = meter
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or not scope["path"].startswith("/v1/"):
-            await self._app(scope, receive, send)
-            return
-        try:
-            with self._admission.admitted():
-                await self._app(scope, receive, send)
-        except Draining as error:
-            self._meter.rejected(error.code)
-            await problems.respond_to(error, scope["state"]["request_id"])(scope, receive, send)
 
 
 def _request_id(scope: Scope) -> str:

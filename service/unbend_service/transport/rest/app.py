@@ -11,7 +11,8 @@ from pydantic.json_schema import models_json_schema
 from unbend_service.application.service import Service
 from unbend_service.settings import Settings
 from unbend_service.transport.rest import cameras, correct, estimate, exchange, grids, health, overlay, pages, problems
-from unbend_service.transport.rest.accounting import Accounting, Admitting
+from unbend_service.transport.rest.accounting import Accounting
+from unbend_service.transport.rest.admitting import Admitting
 from unbend_service.transport.rest.bodies import Bodies
 from unbend_service.transport.rest.parameters import refuse_unknown
 

@@ -63,7 +63,7 @@ TABLE: Mapping[type[errors.UnbendError], tuple[int, str]] = {
 
 _RETRY_AFTER_S = 1
 #: nginx's code for a caller who went away; nobody reads the answer, but it is counted.
-_CLIENT_CLOSED_REQUEST = 499
+CLIENT_CLOSED_REQUEST = 499
 
 
 class Problem(BaseModel):
@@ -184,7 +184,7 @@ def install(app: FastAPI) -> None:
         return respond(request.state.request_id, error.status_code, title, code, detail, headers=error.headers)
 
     async def client_gone(request: Request, error: Exception) -> Response:
-        return Response(status_code=_CLIENT_CLOSED_REQUEST)
+        return Response(status_code=CLIENT_CLOSED_REQUEST)
 
     app.add_exception_handler(errors.UnbendError, unbend_error)
     app.add_exception_handler(RequestValidationError, invalid_query)

@@ -11,6 +11,7 @@ from typing import Any
 import grpc
 import structlog
 
+from unbend_service.application.deadlines import deadline
 from unbend_service.application.service import Service
 from unbend_service.domain.errors import UnbendError
 from unbend_service.transport.rpc.messages import parse, parse_all
@@ -58,7 +59,7 @@ class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg] # g
                     return await unary(parse(method, parser, raw), context)
 
             async def answer(raw: bytes, context: Any) -> Any:
-                return await self._watched(name, request_id, context, call(raw, context))
+                return await self._watched(name, request_id, context, call(raw, context), single=True)
 
             return grpc.unary_unary_rpc_method_handler(answer, None, handler.response_serializer)
         stream: Any = handler.stream_stream
@@ -69,7 +70,9 @@ class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg] # g
 
         return grpc.stream_stream_rpc_method_handler(converse, None, handler.response_serializer)
 
-    async def _watched(self, name: str, request_id: str, context: Context, work: Awaitable[Any]) -> Any:
+    async def _watched(
+        self, name: str, request_id: str, context: Context, work: Awaitable[Any], *, single: bool = False
+    ) -> Any:
         start = time.perf_counter()
 
         def count(code: grpc.StatusCode) -> None:  # before the client knows, so that it sees its call counted
@@ -77,7 +80,7 @@ class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg] # g
 
         try:
             with structlog.contextvars.bound_contextvars(request_id=request_id, method=name):
-                result, status = await self._outcome(name, work)
+                result, status = await self._outcome(work, context.time_remaining(), single)
         except asyncio.CancelledError:
             count(grpc.StatusCode.CANCELLED)
             raise
@@ -88,14 +91,17 @@ class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg] # g
         count(status.code)
         return await context.abort(status.code, status.message, (*status.trailing_metadata, (_REQUEST_ID, request_id)))
 
-    async def _outcome(self, name: str, work: Awaitable[Any]) -> tuple[Any, Status | None]:
-        """What a call returned, or the status that it ends with."""
+    async def _outcome(self, work: Awaitable[Any], left_s: float | None, single: bool) -> tuple[Any, Status | None]:
+        """What a call returned, or the status that it ends with; whatever it does is given up after ``left_s``."""
         admitted = False
         try:
-            with self._service.admission.admitted():
+            with self._service.admission.admitted(single=single):
                 admitted = True
-                return await work, None
+                async with deadline(left_s):
+                    return await work, None
         except UnbendError as error:
+            if not admitted:
+                self._service.meter.rejected(error.code)
             status = status_of(error)
             log.info("refused", code=error.code, message=str(error))
             return None, status
