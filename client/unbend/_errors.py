@@ -62,9 +62,11 @@ class UnbendError(Exception):
         allowed: what would have been accepted, if that can be said.
         setting: name of the server's setting that governs the limit, if one does.
         retry_after_s: seconds after which trying again makes sense, if it does.
+        last_index: of a stream that ended: the last frame that was answered, None if none was.
     """
 
     code: ClassVar[str] = "internal"
+    last_index: int | None = None
 
     def __init__(
         self,

@@ -37,12 +37,15 @@ def translate(error: Any) -> errors.UnbendError:
     if code is None:
         return BY_STATUS[error.code()](error.details() or error.code().name)
     retry_after_s = plain.get("unbend-error-retry-after-s")
-    return errors.BY_CODE.get(code, errors.UnbendError)(
+    translated = errors.BY_CODE.get(code, errors.UnbendError)(
         unquote(plain.get("unbend-error-message", code)),
         allowed=_unquoted(plain.get("unbend-error-allowed")),
         setting=_unquoted(plain.get("unbend-error-setting")),
         retry_after_s=None if retry_after_s is None else float(retry_after_s),
     )
+    last_index = plain.get("unbend-error-last-index")
+    translated.last_index = None if last_index is None else int(last_index)
+    return translated
 
 
 def of_frame(code: str, message: str) -> errors.UnbendError:

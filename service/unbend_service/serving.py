@@ -6,9 +6,11 @@ import asyncio
 import os
 import signal
 import socket
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import grpc
 import structlog
@@ -23,6 +25,9 @@ from unbend_service.transport.rpc.server import start_server
 from unbend_service.wiring import build_service
 
 log = structlog.get_logger(__name__)
+
+#: For the last bytes of answers that are ready, and for all that has to be freed after them.
+_LAST_BYTES_S, _LAST_WORDS_S = 1, 8.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,11 +49,14 @@ class _HttpServer(uvicorn.Server):
 async def serve(settings: Settings, on_ready: Callable[[Addresses], None] | None = None) -> None:
     """Serves until SIGTERM or SIGINT, then drains; a second signal ends the process at once.
 
+    SIGTERM comes from an orchestrator: readiness flips ``drain_notice_s`` before calls are refused. SIGINT comes from
+    somebody at the keyboard, who does not wait for that.
+
     Raises:
         UnbendError: the service cannot start with these settings.
         OSError: an address is taken.
     """
-    stop = asyncio.Event()
+    stop: asyncio.Future[signal.Signals] = asyncio.get_running_loop().create_future()
     _handle_signals(stop)
     http_socket = _bound_socket(settings.http_host, settings.http_port)
     service = build_service(settings)
@@ -68,7 +76,7 @@ async def serve(settings: Settings, on_ready: Callable[[Addresses], None] | None
                 access_log=False,
                 log_config=None,
                 server_header=False,
-                timeout_graceful_shutdown=max(1, round(settings.drain_s)),
+                timeout_graceful_shutdown=_LAST_BYTES_S,
             )
         )
         serving = asyncio.create_task(http_server.serve(sockets=[http_socket]))
@@ -92,9 +100,11 @@ async def serve(settings: Settings, on_ready: Callable[[Addresses], None] | None
         )
         if on_ready is not None:
             on_ready(addresses)
-        stopping = asyncio.create_task(stop.wait())
-        await asyncio.wait({serving, stopping}, return_when=asyncio.FIRST_COMPLETED)
-        await _drain(service, settings, http_server, serving, rpc_server)
+        ends: set[asyncio.Future[Any]] = {serving, stop}
+        await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
+        notice_s = settings.drain_notice_s if stop.done() and stop.result() == signal.SIGTERM else 0.0
+        _end_at_last(notice_s + settings.drain_s + _LAST_WORDS_S)
+        await _drain(service, settings, notice_s, http_server, serving, rpc_server)
     finally:
         http_socket.close()
         if listener is not None:
@@ -105,15 +115,26 @@ async def serve(settings: Settings, on_ready: Callable[[Addresses], None] | None
 async def _drain(
     service: Service,
     settings: Settings,
+    notice_s: float,
     http_server: uvicorn.Server,
     serving: asyncio.Task[None],
     rpc_server: grpc.aio.Server,
 ) -> None:
-    log.info("draining", grace_s=settings.drain_s, active=service.admission.active)
+    """Says that it goes, then refuses, then ends with the last accepted call or after ``drain_s``."""
+    log.info("draining", notice_s=notice_s, grace_s=settings.drain_s, active=service.admission.active)
+    service.admission.leave()
+    await asyncio.sleep(notice_s)
     finished = await service.admission.drain(settings.drain_s)
     http_server.should_exit = True
-    await asyncio.gather(rpc_server.stop(1.0), serving)
+    await asyncio.gather(rpc_server.stop(_LAST_BYTES_S), serving)
     log.info("stopped", finished=finished)
+
+
+def _end_at_last(patience_s: float) -> None:
+    """Ends the process in spite of a thread or a library that does not come back."""
+    timer = threading.Timer(patience_s, os._exit, (1,))
+    timer.daemon = True
+    timer.start()
 
 
 def _bound_socket(host: str, port: int) -> socket.socket:
@@ -126,13 +147,13 @@ def _bound_socket(host: str, port: int) -> socket.socket:
         raise OSError(error.errno, f"HTTP cannot listen on {host}:{port}: {reason}") from error
 
 
-def _handle_signals(stop: asyncio.Event) -> None:
+def _handle_signals(stop: asyncio.Future[signal.Signals]) -> None:
     loop = asyncio.get_running_loop()
 
-    def on_signal() -> None:
-        if stop.is_set():
+    def on_signal(number: signal.Signals) -> None:
+        if stop.done():
             os._exit(1)
-        stop.set()
+        stop.set_result(number)
 
     for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, on_signal)
+        loop.add_signal_handler(number, on_signal, number)

@@ -136,6 +136,12 @@ class Settings(BaseSettings):
         2.0, gt=0, description="Pause between attempts to reach redis again, during which no call waits for it."
     )
 
+    drain_notice_s: float = Field(
+        0.5,
+        ge=0,
+        description="After SIGTERM the service says for so long that it is not ready, and still accepts, so that "
+        "balancers look away before calls are refused.",
+    )
     drain_s: float = Field(20.0, ge=0, description="Grace for accepted work after SIGTERM.")
     log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="Least severe log line.")
     log_format: Literal["console", "json"] = Field("console", description="How log lines look.")

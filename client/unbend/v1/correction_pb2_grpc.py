@@ -64,6 +64,7 @@ class CorrectionServiceServicer:
         the stream after the last result. A stream id has one connection: opening it again ends the older one with ABORTED
         (stream_taken_over), as does silence on both sides (stream_idle). A server that shuts down answers the frames it
         has read and ends with UNAVAILABLE (draining): open the stream elsewhere and send again what was not answered.
+        Whatever a stream ends with, the metadata of its ErrorInfo has stream_id and, if any frame was answered, last_index.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

@@ -41,6 +41,7 @@ class CorrectionServiceStub:
     the stream after the last result. A stream id has one connection: opening it again ends the older one with ABORTED
     (stream_taken_over), as does silence on both sides (stream_idle). A server that shuts down answers the frames it
     has read and ends with UNAVAILABLE (draining): open the stream elsewhere and send again what was not answered.
+    Whatever a stream ends with, the metadata of its ErrorInfo has stream_id and, if any frame was answered, last_index.
     """
 
 @_typing.type_check_only
@@ -56,6 +57,7 @@ class CorrectionServiceAsyncStub(CorrectionServiceStub):
     the stream after the last result. A stream id has one connection: opening it again ends the older one with ABORTED
     (stream_taken_over), as does silence on both sides (stream_idle). A server that shuts down answers the frames it
     has read and ends with UNAVAILABLE (draining): open the stream elsewhere and send again what was not answered.
+    Whatever a stream ends with, the metadata of its ErrorInfo has stream_id and, if any frame was answered, last_index.
     """
 
 class CorrectionServiceServicer(metaclass=_abc_1.ABCMeta):
@@ -80,6 +82,7 @@ class CorrectionServiceServicer(metaclass=_abc_1.ABCMeta):
         the stream after the last result. A stream id has one connection: opening it again ends the older one with ABORTED
         (stream_taken_over), as does silence on both sides (stream_idle). A server that shuts down answers the frames it
         has read and ends with UNAVAILABLE (draining): open the stream elsewhere and send again what was not answered.
+        Whatever a stream ends with, the metadata of its ErrorInfo has stream_id and, if any frame was answered, last_index.
         """
 
 def add_CorrectionServiceServicer_to_server(servicer: CorrectionServiceServicer, server: _typing.Union[_grpc.Server, _aio.Server]) -> None: ...

@@ -26,6 +26,7 @@ class Admission:
         self._singles = 0
         self._mean_call_s = 0.1
         self._active = 0
+        self._leaving = False
         self._draining = False
         self._idle = asyncio.Event()
         self._idle.set()
@@ -36,8 +37,17 @@ class Admission:
         self._listeners.append(listener)
 
     @property
+    def leaving(self) -> bool:
+        """Whether the service will drain, or does: balancers and callers had better go elsewhere."""
+        return self._leaving
+
+    @property
     def draining(self) -> bool:
         return self._draining
+
+    def leave(self) -> None:
+        """Says that draining comes soon; calls are let in until it does."""
+        self._leaving = True
 
     @property
     def active(self) -> int:
@@ -72,7 +82,7 @@ class Admission:
     async def drain(self, grace_s: float) -> bool:
         """Refuses new calls and waits for those under way; False if some are left after ``grace_s`` seconds."""
         if not self._draining:
-            self._draining = True
+            self._leaving = self._draining = True
             for listener in self._listeners:
                 listener()
         try:

@@ -83,7 +83,7 @@ class Service:
         """Cheap; asked by probes."""
         state = self.pool.state()
         reasons = [] if state.ready else [state.reason]
-        if self.admission.draining:
+        if self.admission.leaving:
             reasons.append("The service is shutting down.")
         return Readiness(not reasons, reasons, state, self.model, self.streams.active, self.admission.active, self.role)
 

@@ -42,6 +42,7 @@ class StreamSession:
         stream_id: to be used for resuming.
         resumed: whether the stream id was known and its grid is reused.
         ended_with: why the service ended it early, if it did.
+        last_index: of the last frame whose answer was taken.
     """
 
     stream_id: str
@@ -51,6 +52,7 @@ class StreamSession:
     owner: asyncio.Task[object]
     resumed: bool = False
     ended_with: UnbendError | None = None
+    last_index: int | None = None
     _entries: asyncio.Queue[_Entry | None] = field(default_factory=asyncio.Queue)
     _tasks: set[asyncio.Task[None]] = field(default_factory=set)
     _reader: asyncio.Task[None] | None = None
@@ -91,6 +93,7 @@ class StreamSession:
                 announced = True
                 yield GridFixed(fixed.record)
             yield result
+            self.last_index = entry.index
             self._touch()
             self._answered(entry)
         await self._reader

@@ -17,7 +17,7 @@ from unbend_service.application.stream_grid import StreamGrid
 from unbend_service.application.stream_messages import StreamConfig
 from unbend_service.application.stream_session import StreamSession
 from unbend_service.application.turns import Turns
-from unbend_service.domain.errors import Draining, StreamTakenOver, TooManyStreams
+from unbend_service.domain.errors import Draining, Resume, StreamTakenOver, TooManyStreams, UnbendError
 from unbend_service.settings import Settings
 
 
@@ -87,7 +87,11 @@ class Streams:
         except asyncio.CancelledError:
             if session.ended_with is None or session.owner.uncancel() > 0:
                 raise
+            session.ended_with.resume = Resume(stream_id, session.last_index)
             raise session.ended_with from None
+        except UnbendError as error:
+            error.resume = Resume(stream_id, session.last_index)
+            raise
         finally:
             if self._live.get(stream_id) is session:
                 del self._live[stream_id]

@@ -46,7 +46,16 @@ The errors know neither HTTP nor gRPC: each transport owns one table from these 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import ClassVar
+
+
+@dataclass(frozen=True, slots=True)
+class Resume:
+    """Where to go on with a stream that ended: after frame ``last_index``, None if none was answered."""
+
+    stream_id: str
+    last_index: int | None
 
 
 class UnbendError(Exception):
@@ -57,9 +66,13 @@ class UnbendError(Exception):
         allowed: what would have been accepted, if that can be said.
         setting: name of the setting that governs the limit, if one does.
         retry_after_s: seconds after which trying again makes sense, if it does.
+
+    Attributes:
+        resume: of an error that a stream ends with.
     """
 
     code: ClassVar[str] = "internal"
+    resume: Resume | None = None
 
     def __init__(
         self,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 
-from starlette.datastructures import Headers
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -40,6 +40,12 @@ class Admitting:
         async def noting(message: Message) -> None:
             nonlocal started
             started = True
+            await parting(message)
+
+        async def parting(message: Message) -> None:
+            """Before a service goes, callers are asked to close: no request of theirs meets a closed connection."""
+            if message["type"] == "http.response.start" and self._admission.leaving:
+                MutableHeaders(scope=message)["Connection"] = "close"
             await send(message)
 
         try:
@@ -53,7 +59,7 @@ class Admitting:
                 raise  # the answer is half sent; only the server can cut the connection
             if not admitted:
                 self._meter.rejected(error.code)
-            await problems.respond_to(error, scope["state"]["request_id"])(scope, receive, send)
+            await problems.respond_to(error, scope["state"]["request_id"])(scope, receive, parting)
 
     async def _watched(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Runs the call until its caller is gone."""

@@ -64,7 +64,8 @@ class Status:
     Attributes:
         trailing_metadata: ``grpc-status-details-bin`` (google.rpc.Status with ErrorInfo and, where trying again helps,
             RetryInfo), and the same in plain keys for clients without google.rpc: ``unbend-error-code``,
-            ``-message``, ``-allowed``, ``-setting`` (percent-encoded UTF-8) and ``-retry-after-s``.
+            ``-message``, ``-allowed``, ``-setting`` (percent-encoded UTF-8) and ``-retry-after-s``; of a stream that
+            ended ``-stream-id`` and, if any frame was answered, the ``-last-index`` that was.
     """
 
     code: grpc.StatusCode
@@ -83,9 +84,16 @@ def status_of(error: errors.UnbendError) -> Status:
     code = next(STATUS_CODES[kind] for kind in type(error).__mro__ if kind in STATUS_CODES)
     info = error_details_pb2.ErrorInfo(reason=error.code.upper(), domain=ERROR_DOMAIN)
     plain = {"unbend-error-code": error.code, "unbend-error-message": quote(error.message, safe=_PLAIN)}
-    for name, value in (("allowed", error.allowed), ("setting", error.setting)):
+    last_index = None if error.resume is None or error.resume.last_index is None else str(error.resume.last_index)
+    stream_id = None if error.resume is None else error.resume.stream_id
+    for name, value in (
+        ("allowed", error.allowed),
+        ("setting", error.setting),
+        ("stream-id", stream_id),
+        ("last-index", last_index),
+    ):
         if value is not None:
-            info.metadata[name] = value
+            info.metadata[name.replace("-", "_")] = value
             plain[f"unbend-error-{name}"] = quote(value, safe=_PLAIN)
     details = [_packed(info)]
     if error.retry_after_s is not None:
