@@ -93,6 +93,7 @@ class SqliteGridStore:
 
     async def release_stream(self, stream_id: str, token: str) -> None:
         await self._run(self._release_stream, stream_id, token)
+
     async def camera(self, name: str) -> bytes | None:
         return await self._run(self._camera, name)
 
