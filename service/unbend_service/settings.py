@@ -85,6 +85,15 @@ class Settings(BaseSettings):
     animation_frames: int = Field(1, ge=1, description="Most frames of an animated image.")
     jpeg_quality: int = Field(92, ge=1, le=100, description="Quality when the request names none.")
 
+    decoders: int = Field(0, ge=0, le=256, description="Processes that decode images; 0: one per usable core.")
+    decode_memory_bytes: int = Field(
+        2 << 30, ge=64 << 20, description="Memory that decoding one image may take, beside what a decoder starts with."
+    )
+    decode_deadline_s: float = Field(30.0, gt=0, description="Longest time that decoding one image may take.")
+    pictures_bytes: int = Field(
+        2 << 30, ge=1 << 20, description="Memory of all decoded images together; one more is refused with 429."
+    )
+
     http_connections: int = Field(1024, ge=1, description="HTTP connections that may be open at once.")
     http_header_bytes: int = Field(64 << 10, ge=1024, description="Largest request line and headers; more gets 431.")
     http_header_s: float = Field(10.0, gt=0, description="Longest wait for a request line and headers.")

@@ -6,6 +6,9 @@ from collections.abc import Callable
 
 from unbend_service.adapters.codecs.pillow import PillowCodec
 from unbend_service.adapters.cores import usable_cores
+from unbend_service.adapters.decoding.codec import IsolatedCodec
+from unbend_service.adapters.decoding.files import IsolatedFiles
+from unbend_service.adapters.decoding.pool import DecoderPool
 from unbend_service.adapters.drawing.overlay import OverlayIllustrator
 from unbend_service.adapters.estimators.catalogue import load_estimator
 from unbend_service.adapters.estimators.remote import RemoteEstimator
@@ -89,7 +92,8 @@ def build_service(settings: Settings, meter: PrometheusMeter | None = None) -> S
     """
     meter = meter or PrometheusMeter()
     blocking = BlockingWork(usable_cores(), settings.queue_frames, meter)
-    codec = PillowCodec(settings)
+    decoders = DecoderPool(settings, meter)
+    codec = IsolatedCodec(decoders, PillowCodec(settings))
     store = build_store(settings, meter)
     fitted_grids = FittedGrids(blocking, meter)
     pool = build_pool(settings, meter)
@@ -130,7 +134,7 @@ def build_service(settings: Settings, meter: PrometheusMeter | None = None) -> S
         estimation, codec, store, OverlayIllustrator(), blocking, jpeg_quality=settings.jpeg_quality
     )
     grids = GridLibrary(store, blocking, grid_points=settings.grid_points)
-    exchange = Exchange(ExchangeFiles(), fitted_grids, blocking)
+    exchange = Exchange(IsolatedFiles(decoders), fitted_grids, blocking)
     regions = Regions(pool, settings.local_memory_bytes)
     streams = Streams(estimation, correction, store, codec, blocking, meter, regions, settings)
     return Service(

@@ -240,6 +240,8 @@ async def test_a_claim_lapses_unless_it_is_renewed(store: GridStore, clock: Cloc
     assert not await store.claim_stream("camera-7", "heir", 0.3)
     await pass_by(0.2)
     assert await store.claim_stream("camera-7", "heir", 0.3)
+
+
 async def test_what_is_remembered_of_a_camera_is_swapped_for_what_is_known(store: GridStore) -> None:
     """Of two that write at the same time the second is told, and nothing is overwritten."""
     assert await store.camera("dashcam") is None

@@ -319,6 +319,14 @@ class DecodedImage:
 class ImageCodec(Protocol):
     """Encoded images to frames and back. Thread-safe; blocking."""
 
+    def start(self) -> None:
+        """Makes ready what decodes; returns at once."""
+        ...
+
+    def close(self) -> None:
+        """Frees what it holds; what is decoded then may fail."""
+        ...
+
     def probe(self, body: bytes) -> ImageHeader:
         """Reads the header only.
 

@@ -75,6 +75,7 @@ class Service:
 
     async def start(self) -> None:
         """Starts the render workers. Raises RendererUnavailable."""
+        self.codec.start()
         await self.pool.start()
         self.meter.model(self.model)
         self.meter.pool(self.pool.state())
@@ -93,6 +94,7 @@ class Service:
         await self.admission.drain(grace_s)
         await self.pool.close(max(0.0, end - time.monotonic()))
         self.blocking.close()
+        self.codec.close()
         await self.store.close()
         for free in self.closing:
             free()

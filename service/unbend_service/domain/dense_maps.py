@@ -71,6 +71,11 @@ class PixelMap:
         self._source = source_width or self._width, source_height or self._height
         self._maps = map_x, map_y
 
+    @property
+    def maps(self) -> tuple[Float32, Float32]:
+        """map_x and map_y."""
+        return self._maps
+
     def __call__(self, target: Float64) -> Float64:
         """(..., 2) float64 centred target points -> (..., 2) float64 centred source points."""
         column = (target[..., 0] + 1) / 2 * self._width - 0.5

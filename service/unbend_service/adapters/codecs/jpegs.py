@@ -6,6 +6,8 @@ better what is wrong.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import simplejpeg
 
@@ -17,13 +19,18 @@ _ICC_MARK = b"ICC_PROFILE\0"
 _ICC_PART_BYTES = _LONGEST_SEGMENT_BYTES - len(_ICC_MARK) - 2
 
 
-def decode_rgb(body: bytes) -> Bytes | None:
-    """(height, width, 3) uint8 RGB of a YCbCr file, not turned; None for any file that is better left to Pillow."""
+def decode_rgb(body: bytes, place: Callable[[int], Bytes] | None = None) -> Bytes | None:
+    """(height, width, 3) uint8 RGB of a YCbCr file, not turned; None for any file that is better left to Pillow.
+
+    Args:
+        place: gives the (n,) uint8 memory to decode into.
+    """
     try:
-        _, _, space, _ = simplejpeg.decode_jpeg_header(body)
+        height, width, space, _ = simplejpeg.decode_jpeg_header(body)
         if space != "YCbCr":
             return None
-        return np.asarray(simplejpeg.decode_jpeg(body, colorspace="RGB", strict=True))
+        memory = None if place is None else place(3 * width * height)
+        return np.asarray(simplejpeg.decode_jpeg(body, colorspace="RGB", strict=True, buffer=memory))
     except ValueError:
         return None
 

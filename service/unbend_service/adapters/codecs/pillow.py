@@ -11,8 +11,9 @@ import io
 import threading
 import warnings
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -26,11 +27,17 @@ from PIL.WebPImagePlugin import WebPImageFile
 from unbend_service.adapters.codecs import exif
 from unbend_service.adapters.codecs.cameras import camera_name
 from unbend_service.adapters.codecs.jpegs import decode_luma, decode_rgb, encode_packed
-from unbend_service.adapters.codecs.signatures import announced_size, sniff
+from unbend_service.adapters.codecs.signatures import announced_size, check_scans, sniff
 from unbend_service.application.ports import Bytes, DecodedImage, ImageHeader, PictureOrigin
-from unbend_service.domain.errors import InvalidFrame, InvalidImage, InvalidOption, TooManyPixels, UnbendError
+from unbend_service.domain.errors import (
+    ImageTooCostly,
+    InvalidFrame,
+    InvalidImage,
+    InvalidOption,
+    TooManyPixels,
+    UnbendError,
+)
 from unbend_service.domain.frames import Frame, PixelFormat
-from unbend_service.settings import Settings
 
 WRITTEN_FORMATS = ("jpeg", "png", "webp")
 
@@ -64,6 +71,9 @@ _PACKED_ORDERS = {PixelFormat.RGB24: "RGB", PixelFormat.BGR24: "BGR"}
 _PROFILE_SPACES = {"L": b"GRAY", "RGB": b"RGB ", "RGBA": b"RGB "}
 _LONGEST_SIDE_PX = {"jpeg": 65_500, "png": 2**31 - 1, "webp": 16_383}
 _MAX_JPEG_EXIF_BYTES = 65_533 - 6
+#: More than any camera writes or any press needs: it would come back with every picture.
+_MAX_EXIF_BYTES = 1 << 20
+_MAX_PROFILE_BYTES = 4 << 20
 # A reduced decode averages over whole blocks, and the padding of the last block shows in a picture that is only thin.
 _SHORTEST_DRAFT_PX = 64
 # Half of 1920 is near enough to 1024, and costs far less than the next larger scale.
@@ -73,6 +83,16 @@ _SUBSAMPLING = "4:2:0"
 _WHITE = (255, 255, 255)
 
 
+class Limits(Protocol):
+    """The settings that bound what is decoded."""
+
+    @property
+    def source_pixels(self) -> int: ...
+
+    @property
+    def animation_frames(self) -> int: ...
+
+
 class PillowCodec:
     """Port ImageCodec.
 
@@ -80,7 +100,7 @@ class PillowCodec:
         settings: ``source_pixels`` and ``animation_frames`` bound what is decoded.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Limits) -> None:
         self.source_pixels = settings.source_pixels
         self.animation_frames = settings.animation_frames
 
@@ -99,18 +119,28 @@ class PillowCodec:
         width, height = (image.height, image.width) if turned else image.size
         return PictureOrigin(width / height, camera_name(block, width, height) if block else None)
 
-    def decode(self, body: bytes) -> DecodedImage:
-        """Raises as :meth:`probe`, and InvalidImage for a broken body."""
+    def start(self) -> None:
+        """Nothing to do: it works in the calling thread."""
+
+    def close(self) -> None:
+        """Nothing to do."""
+
+    def decode(self, body: bytes, place: Callable[[int], Bytes] | None = None) -> DecodedImage:
+        """Raises as :meth:`probe`, ImageTooCostly, and InvalidImage for a broken body.
+
+        Args:
+            place: gives (n,) uint8 memory that the pixels are decoded into, for files where that is possible.
+        """
         image_format = sniff(body)
         image = self._open(body, image_format)
         with _translated(image_format):
-            pixels = decode_rgb(body) if image_format == "jpeg" and image.mode == "RGB" else None
+            pixels = decode_rgb(body, place) if image_format == "jpeg" and image.mode == "RGB" else None
             if pixels is None:
                 image.load()
             # TIFF is turned upright by its plugin, and its EXIF block is the file itself
             block = exif.bare(image.info.get("exif") or b"") if image_format != "tiff" else b""
             method = _UPRIGHT.get(exif.orientation(block))
-            profile = image.info.get("icc_profile") or None
+            profile = _bounded_profile(image)
             if pixels is not None and method is None:
                 frame = Frame(PixelFormat.RGB24, image.width, image.height, pixels.reshape(-1))
             else:
@@ -121,7 +151,7 @@ class PillowCodec:
         return DecodedImage(
             frame,
             image_format,
-            exif=(exif.upright(block) if block else None),
+            exif=(exif.upright(block) if 0 < len(block) <= _MAX_EXIF_BYTES else None),
             icc_profile=profile if _describes(profile, _MODES[frame.pixel_format]) else None,
             upright=method is None,
             chroma_subsampling=_subsampling(image),
@@ -184,10 +214,12 @@ class PillowCodec:
         """Reads the header and holds it against the limits, before any pixel is allocated."""
         announced = announced_size(body, image_format)
         if announced is not None:
-            self._check_size(*announced)
+            self.check_size(*announced)
         with _translated(image_format), _without_warnings():
+            if image_format == "jpeg":
+                check_scans(body)
             image = _OPENERS[image_format](io.BytesIO(body))
-            self._check_size(*image.size)
+            self.check_size(*image.size)
             frames = 1 if image_format == "tiff" else getattr(image, "n_frames", 1)
         if frames > self.animation_frames:
             raise InvalidImage(
@@ -197,7 +229,8 @@ class PillowCodec:
             )
         return image
 
-    def _check_size(self, width: int, height: int) -> None:
+    def check_size(self, width: int, height: int) -> None:
+        """Raises InvalidImage, TooManyPixels."""
         if width < 1 or height < 1:
             raise InvalidImage(f"The header announces {width}x{height} pixels.", allowed="at least 1x1")
         if width * height > self.source_pixels:
@@ -226,6 +259,10 @@ def _translated(image_format: str) -> Iterator[None]:
         yield
     except UnbendError:
         raise
+    except MemoryError as error:
+        raise ImageTooCostly(
+            f"Decoding the {image_format} image takes more memory than is granted.", setting="decode_memory_bytes"
+        ) from error
     except Image.DecompressionBombError as error:
         raise TooManyPixels(str(error), setting="source_pixels") from error
     except Exception as error:
@@ -265,6 +302,13 @@ def _to_srgb(image: Image.Image, profile: bytes) -> Image.Image:
     except (ImageCms.PyCMSError, OSError):  # a broken profile is as good as none
         converted = None
     return image.convert("RGB") if converted is None else converted
+
+
+def _bounded_profile(image: Image.Image) -> bytes | None:
+    profile = image.info.get("icc_profile") or None
+    if profile is not None and len(profile) > _MAX_PROFILE_BYTES:
+        raise InvalidImage(f"An ICC profile of {len(profile)} bytes.", allowed=f"{_MAX_PROFILE_BYTES} bytes")
+    return profile
 
 
 def _describes(profile: bytes | None, mode: str) -> bool:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from unbend_service.domain.errors import EmptyBody, InvalidImage, UnsupportedMediaType
 
+#: Encoders write 10 to 20 scans, the format allows any number, and each goes over all of the picture again.
+MOST_SCANS = 100
+_SCAN = b"\xff\xda"
 READ_FORMATS = ("jpeg", "png", "webp", "tiff", "bmp")
 
 
@@ -55,3 +58,20 @@ def _webp_size(body: bytes) -> tuple[int, int]:
     if chunk == b"VP8 " and len(body) >= 30 and body[23:26] == b"\x9d\x01\x2a":
         return int.from_bytes(body[26:28], "little") & 0x3FFF, int.from_bytes(body[28:30], "little") & 0x3FFF
     raise InvalidImage("The webp header is broken or cut off.")
+
+
+def check_scans(body: bytes) -> None:
+    """Raises InvalidImage for a JPEG of more scans than any encoder writes.
+
+    Segments before the first scan are skipped by their lengths: a thumbnail has scans of its own. In the samples
+    themselves no byte pair looks like the start of a scan.
+    """
+    position = 2
+    while position + 4 <= len(body) and body[position] == 0xFF and body[position : position + 2] != _SCAN:
+        alone = body[position + 1] in (0x01, 0xFF, *range(0xD0, 0xD9))  # fill bytes, and markers without a length
+        position += 1 if body[position + 1] == 0xFF else 2
+        if not alone:
+            position += int.from_bytes(body[position : position + 2])
+    scans = body.count(_SCAN, position)
+    if scans > MOST_SCANS:
+        raise InvalidImage(f"The jpeg has {scans} scans.", allowed=f"{MOST_SCANS}")

@@ -6,6 +6,7 @@ parent ends, and the small /dev/shm of a container is no limit. The descriptor g
 
 from __future__ import annotations
 
+import fcntl
 import mmap
 import os
 from collections import OrderedDict
@@ -47,9 +48,11 @@ class Slot:
     @classmethod
     def create(cls, number: int, size_bytes: int) -> Slot:
         """Raises OSError where the kernel gives no memory or no descriptor."""
-        fd = os.memfd_create(f"unbend-slot-{number}", os.MFD_CLOEXEC)
+        fd = os.memfd_create(f"unbend-slot-{number}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         try:
             os.ftruncate(fd, size_bytes)
+            # who is handed the descriptor cannot take the memory away under those who look at it
+            fcntl.fcntl(fd, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL)
             return cls(number, fd, size_bytes)
         except BaseException:
             os.close(fd)
