@@ -118,6 +118,7 @@ overload: setup-dev  ## Three times the work that fits, for OVERLOAD_S seconds
 	$(BIN)/python -m tests.endurance overload --seconds $(OVERLOAD_S)
 
 .PHONY: chaos soak overload
+
 fuzz: setup-dev  ## Send FUZZ_N (100,000) malformed inputs over both transports to a real service; the last line is the verdict
 	$(BIN)/python -m tests.fuzz
 
