@@ -53,21 +53,21 @@ class Pool:
         """One frame, alone in the pool."""
         self._runner.run(self._render(frame, grid))
 
-    def many(self, batch: list[Frame], grid: Grid) -> None:
-        """All frames, IN_FLIGHT at a time."""
-        self._runner.run(self._flow(batch, grid))
+    def many(self, batch: list[Frame], grid: Grid, in_flight: int = IN_FLIGHT) -> None:
+        """All frames, ``in_flight`` at a time."""
+        self._runner.run(self._flow(batch, grid, in_flight))
 
     async def _render(self, frame: Frame, grid: Grid) -> None:
         await self._pool.render(frame, grid, BLACK)
 
-    async def _flow(self, batch: list[Frame], grid: Grid) -> None:
+    async def _flow(self, batch: list[Frame], grid: Grid, in_flight: int) -> None:
         waiting = iter(batch)
 
         async def take() -> None:
             for frame in waiting:
                 await self._pool.render(frame, grid, BLACK)
 
-        await asyncio.gather(*(take() for _ in range(IN_FLIGHT)))
+        await asyncio.gather(*(take() for _ in range(in_flight)))
 
     def close(self) -> None:
         self._runner.run(self._pool.close(1.0))

@@ -23,6 +23,7 @@ import unbend
 from benchmarks.echo import METHOD, echo_served
 from benchmarks.material import BareRemap, barrel_grid, frames, jpeg, photograph
 from benchmarks.measurement import Report, Timing, by_turns
+from benchmarks.render import Pool
 from benchmarks.serving import Served, served
 from unbend._channel import open_channel
 from unbend_service.adapters.cores import usable_cores
@@ -33,7 +34,7 @@ from unbend_service.domain.grid import Grid
 
 WIDTH, HEIGHT = 1920, 1080
 IN_FLIGHT = 8
-BAR_ECHO, BAR_JPEG, BAR_FFMPEG = 0.80, 0.80, 1.3
+BAR_ECHO, BAR_JPEG, BAR_FFMPEG, BAR_SHARED = 0.80, 0.80, 1.3, 0.85
 DISTINCT = 8
 
 
@@ -50,7 +51,11 @@ def run(arguments: argparse.Namespace) -> Report:
     runs, count = (2, 4) if arguments.quick else (arguments.runs, arguments.frames)
     cv2.setNumThreads(usable_cores())
     grid = barrel_grid()
-    with served(renderer="cpu") as service:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        served(renderer="cpu", local_socket=f"{folder}/frames.sock") as service,
+    ):
+        _shared(report, service, f"{folder}/frames.sock", grid, runs, count)
         _raw(report, service, grid, runs, count)
         _jpeg(report, service, grid, runs, count)
         for streams in (2,) if arguments.quick else arguments.streams:
@@ -95,6 +100,29 @@ def _raw(report: Report, service: Served, grid: Grid, runs: int, count: int) -> 
             pair = by_turns(ours, lambda: subprocess.run(command, check=True), runs, warm_up=1)
             _add(report, "raw i420 stream over gRPC", pair.per(count), "ffmpeg remap filter")
             report.add_ratio("raw i420 stream / ffmpeg remap filter, frames/s", 1 / pair.ratio, at_least=BAR_FFMPEG)
+
+
+def _shared(report: Report, service: Served, socket: str, grid: Grid, runs: int, count: int) -> None:
+    """Raw frames through memory that is shared with the service, beside a pool that is called in this process."""
+    batch = frames(PixelFormat.I420, WIDTH, HEIGHT, DISTINCT)
+    arrays = [frame.data.reshape(HEIGHT * 3 // 2, WIDTH) for frame in batch]
+    pool = Pool("cpu", usable_cores())
+    with unbend.Client(service.grpc, shared_memory=socket) as sharing, unbend.Client(service.grpc) as client:
+        record = client.grids.put(unbend.Grid(grid.source))
+
+        def through(face: unbend.Client) -> None:
+            with face.stream(WIDTH, HEIGHT, "i420", grid=record, fit="keep", in_flight=IN_FLIGHT) as stream:
+                _drain(stream.correct(arrays[n % DISTINCT] for n in range(count)), count)
+
+        def alone() -> None:
+            pool.many([batch[n % DISTINCT] for n in range(count)], grid, IN_FLIGHT)
+
+        pair = by_turns(lambda: through(sharing), alone, runs, warm_up=1)
+        _add(report, "raw i420 stream over shared memory", pair.per(count), "the pool alone, in process")
+        report.add_ratio("raw i420 stream over shared memory / pool, frames/s", 1 / pair.ratio, at_least=BAR_SHARED)
+        pair = by_turns(lambda: through(sharing), lambda: through(client), runs, warm_up=1)
+        _add(report, "raw i420 stream over shared memory", pair.per(count), "the same over gRPC alone")
+    pool.close()
 
 
 def _jpeg(report: Report, service: Served, grid: Grid, runs: int, count: int) -> None:

@@ -16,6 +16,7 @@ import grpc
 import structlog
 import uvicorn
 
+from unbend_service.allocator import share_arenas
 from unbend_service.application.service import Service
 from unbend_service.settings import Settings
 from unbend_service.transport.local.listener import MemoryListener
@@ -56,6 +57,7 @@ async def serve(settings: Settings, on_ready: Callable[[Addresses], None] | None
         UnbendError: the service cannot start with these settings.
         OSError: an address is taken.
     """
+    share_arenas()
     stop: asyncio.Future[signal.Signals] = asyncio.get_running_loop().create_future()
     _handle_signals(stop)
     http_socket = _bound_socket(settings.http_host, settings.http_port)
