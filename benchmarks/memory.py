@@ -61,7 +61,6 @@ def _load(service: Served, end: float, random: Random) -> None:
     batch = frames(PixelFormat.I420, 640, 360, 4)
     arrays = [frame.data.reshape(540, 640) for frame in batch]
     body = jpeg(photograph(1280, 720, random.randrange(1000)))
-    connection = http.client.HTTPConnection(service.http)
     with unbend.Client(service.grpc, timeout_s=60) as client:
         record = client.grids.put(unbend.Grid(barrel_grid().source))
         while time.monotonic() < end:
@@ -70,6 +69,7 @@ def _load(service: Served, end: float, random: Random) -> None:
                 for result in stream.correct(arrays[n % 4] for n in range(30)):
                     if result.index == give_up_at:
                         break
+            connection = http.client.HTTPConnection(service.http)  # an idle one would be closed while streams run
             connection.request("POST", "/v1/correct", body + random.randbytes(8), {"content-type": "image/jpeg"})
             connection.getresponse().read()
-    connection.close()
+            connection.close()

@@ -10,7 +10,7 @@ from tests.fakes import RecordingMeter
 from unbend_service.adapters.renderers.egl import EglRenderer
 from unbend_service.adapters.renderers.pool import WorkerPool
 from unbend_service.domain.errors import RendererUnavailable, RenderFailed
-from unbend_service.domain.frames import BLACK, Frame, PixelFormat
+from unbend_service.domain.frames import BLACK, Border, Frame, PixelFormat, frame_size_bytes
 from unbend_service.domain.grid import Grid
 from unbend_service.settings import Settings
 
@@ -85,6 +85,33 @@ def test_an_error_of_opengl_is_an_error_of_the_frame() -> None:
     renderer.render(frame, Grid.identity(), BLACK, target)
     np.testing.assert_array_equal(target, frame.data)
     renderer.close()
+
+
+@pytest.mark.parametrize("pixel_format", PixelFormat)
+def test_pixel_buffers_change_no_pixel(pixel_format: PixelFormat) -> None:
+    """What travels through pixel buffers, as on a GPU, is what direct transfers bring: for each format, for odd sizes,
+    for frames one after the other, and after another size came between."""
+    bent = Grid.from_map(lambda p: p * (1 + 0.12 * (p**2).sum(axis=-1, keepdims=True)))
+    random = np.random.default_rng(0)
+    frames = [
+        Frame(
+            pixel_format,
+            width,
+            height,
+            random.integers(0, 256, frame_size_bytes(pixel_format, width, height), np.uint8),
+        )
+        for width, height in ((64, 36), (64, 36), (33, 17), (64, 36))
+    ]
+    opened().close()
+    pictures = []
+    for buffers in (False, True):
+        renderer = EglRenderer(pixel_buffers=buffers)
+        pictures.append([np.empty_like(frame.data) for frame in frames])
+        for frame, target in zip(frames, pictures[-1], strict=True):
+            renderer.render(frame, bent, Border(200, 30, 250), target)
+        renderer.close()
+    for direct, buffered in zip(*pictures, strict=True):
+        np.testing.assert_array_equal(direct, buffered)
 
 
 async def test_workers_render_with_egl() -> None:

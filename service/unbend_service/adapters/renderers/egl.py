@@ -70,14 +70,30 @@ void main() {
 
 @dataclass(frozen=True, slots=True)
 class _Surface:
-    """Texture and framebuffer for planes of one size."""
+    """Texture and framebuffer of one plane, and its pixel buffers where transfers go through them."""
 
     texture: Any
     framebuffer: Any
+    upload: Any = None
+    download: Any = None
 
     def release(self) -> None:
         self.framebuffer.release()
         self.texture.release()
+        for buffer in (self.upload, self.download):
+            if buffer is not None:
+                buffer.release()
+
+
+@dataclass(frozen=True, slots=True)
+class _Surfaces:
+    """Those of a frame, plane by plane."""
+
+    planes: tuple[_Surface, ...]
+
+    def release(self) -> None:
+        for surface in self.planes:
+            surface.release()
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,11 +118,14 @@ class EglRenderer:
     reports an error, a small picture is drawn whose outcome is known.
 
     Cost of a frame: each plane is uploaded, drawn in one pass and read back; a new grid costs its mesh, a new size its
-    texture and framebuffer.
+    textures, framebuffers and pixel buffers. On a GPU all planes are handed over before the first is waited for,
+    through pixel buffers that stay, so one is drawn while another travels; frames overlap across the workers, each
+    with a context of its own. A software renderer would only copy twice: there the transfers are direct.
 
     Args:
         device: index of the EGL device, as the driver lists them.
-        cache_bytes: bound on the meshes, and on the textures and framebuffers, that are kept.
+        cache_bytes: bound on the meshes, and on the textures, framebuffers and pixel buffers, that are kept.
+        pixel_buffers: whether transfers go through pixel buffers; None: on a GPU.
 
     Raises:
         RendererUnavailable: no OpenGL 3.3 context can be had, or this process has one already.
@@ -114,7 +133,7 @@ class EglRenderer:
 
     _open: ClassVar[bool] = False
 
-    def __init__(self, device: int = 0, cache_bytes: int = 256 << 20) -> None:
+    def __init__(self, device: int = 0, cache_bytes: int = 256 << 20, pixel_buffers: bool | None = None) -> None:
         if EglRenderer._open:
             raise RendererUnavailable("This process has an EGL renderer already; close it first.")
         egl: dict[str, Any] = {"backend": "egl", "device_index": device}
@@ -132,10 +151,11 @@ class EglRenderer:
             self._context.program(vertex_shader=_VERTEX_SHADER, fragment_shader=shader)
             for shader in (_FRAGMENT_SHADER, _BORDERED_FRAGMENT_SHADER)
         )
-        self._surfaces: Recent[tuple[int, int, int], _Surface] = Recent(cache_bytes, _Surface.release)
+        self._surfaces: Recent[tuple[Plane, ...], _Surfaces] = Recent(cache_bytes, _Surfaces.release)
         self._meshes: Recent[str, _Mesh] = Recent(cache_bytes, _Mesh.release)
         self._info = self._describe()
         self._mark = np.frombuffer(os.urandom(_MARK_BYTES), np.uint8)
+        self._pixel_buffers = self._info.hardware if pixel_buffers is None else pixel_buffers
         self._closed = False
         EglRenderer._open = True
 
@@ -149,7 +169,7 @@ class EglRenderer:
 
     @property
     def kept_bytes(self) -> int:
-        """Bytes of the meshes, textures and framebuffers that are kept now."""
+        """Bytes of the meshes, textures, framebuffers and pixel buffers that are kept now."""
         return self._surfaces.size_bytes + self._meshes.size_bytes
 
     def render(self, source: Frame, grid: Grid, border: Border, target: Bytes) -> None:
@@ -181,11 +201,22 @@ class EglRenderer:
         layout = planes(source.pixel_format, source.width, source.height)
         try:
             mesh = self._mesh(grid)
-            for plane, colour in zip(layout, colours, strict=True):
+            surfaces = self._surfaces_of(layout)
+            for plane, colour, surface in zip(layout, colours, surfaces, strict=True):
                 part = slice(plane.offset, plane.offset + plane.size_bytes)
                 sampling = PlaneSampling.of(source, plane)
                 bordered = not sampling.shows_only_source(grid)
-                self._draw(plane, sampling, mesh, colour, bordered, source.data[part], target[part])
+                self._upload(surface, source.data[part])
+                self._draw(plane, surface, sampling, mesh, colour, bordered)
+                drawn: Any = target[part]
+                if surface.download is not None:
+                    drawn = surface.download
+                    mark = self._mark[: plane.size_bytes]  # what an earlier frame left there must not pass for this one
+                    drawn.write(mark, offset=plane.size_bytes - mark.size)
+                surface.framebuffer.read_into(drawn, components=plane.channels, alignment=1)
+            for plane, surface in zip(layout, surfaces, strict=True):
+                if surface.download is not None:  # waits for this plane; those after it are still on their way
+                    surface.download.read_into(target[plane.offset : plane.offset + plane.size_bytes])
         except moderngl.Error as error:
             return f"OpenGL could not render the frame: {error}"
         code = self._context.error
@@ -200,18 +231,23 @@ class EglRenderer:
                 return False
         return True
 
+    def _upload(self, surface: _Surface, source: Bytes) -> None:
+        if surface.upload is None:
+            surface.texture.write(source, alignment=1)
+            return
+        surface.upload.orphan()  # the driver may still be reading what was there, and need not be waited for
+        surface.upload.write(source)
+        surface.texture.write(surface.upload, alignment=1)
+
     def _draw(
         self,
         plane: Plane,
+        surface: _Surface,
         sampling: PlaneSampling,
         mesh: _Mesh,
         colour: tuple[int, ...],
         bordered: bool,
-        source: Bytes,
-        target: Bytes,
     ) -> None:
-        surface = self._surface(plane)
-        surface.texture.write(source, alignment=1)
         uniform = self._bordered_program if bordered else self._program
         uniform["scale"] = tuple(sampling.extent / (plane.width, plane.height))
         uniform["extent"] = tuple(sampling.extent)
@@ -224,13 +260,16 @@ class EglRenderer:
         surface.framebuffer.use()
         surface.texture.use(0)
         (mesh.bordered_array if bordered else mesh.array).render(moderngl.TRIANGLES)
-        surface.framebuffer.read_into(target, components=plane.channels, alignment=1)
+
+    def _surfaces_of(self, layout: tuple[Plane, ...]) -> tuple[_Surface, ...]:
+        kept = self._surfaces.get(layout)
+        if kept is None:
+            copies = 4 if self._pixel_buffers else 2
+            size_bytes = copies * sum(plane.size_bytes for plane in layout)
+            kept = self._surfaces.put(layout, _Surfaces(tuple(map(self._surface, layout))), size_bytes)
+        return kept.planes
 
     def _surface(self, plane: Plane) -> _Surface:
-        key = plane.width, plane.height, plane.channels
-        kept = self._surfaces.get(key)
-        if kept is not None:
-            return kept
         size = plane.width, plane.height
         texture = self._context.texture(size, plane.channels, alignment=1)
         texture.filter = moderngl.LINEAR, moderngl.LINEAR
@@ -241,7 +280,10 @@ class EglRenderer:
             framebuffer = self._context.framebuffer([drawn])
         finally:
             drawn.release()
-        return self._surfaces.put(key, _Surface(texture, framebuffer), 2 * plane.size_bytes)
+        if not self._pixel_buffers:
+            return _Surface(texture, framebuffer)
+        buffers = (self._context.buffer(reserve=plane.size_bytes, dynamic=True) for _ in range(2))
+        return _Surface(texture, framebuffer, *buffers)
 
     def _mesh(self, grid: Grid) -> _Mesh:
         kept = self._meshes.get(grid.id)
