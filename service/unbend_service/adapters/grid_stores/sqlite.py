@@ -53,18 +53,19 @@ class SqliteGridStore:
     Args:
         settings: ``grid_store_path``; ``grid_store_entries`` bounds grids and stream bindings each,
             ``grid_store_ttl_s`` counts from the last use.
-        clock: seconds since the epoch, for they outlive the process.
+        clock: seconds since the epoch, for they outlive the process. By default it is set once, at start: a system
+            clock that jumps afterwards makes no grid too old.
 
     Raises:
         GridStoreUnavailable: the file cannot be opened or is of another make. Every call raises it as well when the
             file or its disk fails.
     """
 
-    def __init__(self, settings: Settings, clock: Callable[[], float] = time.time) -> None:
+    def __init__(self, settings: Settings, clock: Callable[[], float] | None = None) -> None:
         self._path = settings.grid_store_path
         self._entries = settings.grid_store_entries
         self._ttl_s = settings.grid_store_ttl_s
-        self._clock = clock
+        self._clock = clock or _steady_clock()
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="unbend-grid-store")
         self._connection = self._open()
 
@@ -73,7 +74,7 @@ class SqliteGridStore:
 
     async def get(self, grid_id: str) -> GridRecord:
         """Raises GridNotFound."""
-        return await self._run(self._get, grid_id)
+        return await self._run(self._get, grid_id, reading=True)
 
     async def delete(self, grid_id: str) -> None:
         """Raises GridNotFound."""
@@ -85,7 +86,7 @@ class SqliteGridStore:
 
     async def stream_grid(self, stream_id: str) -> str | None:
         """The grid id that was bound; None if there is none, or its grid is gone."""
-        return await self._run(self._stream_grid, stream_id)
+        return await self._run(self._stream_grid, stream_id, reading=True)
 
     async def claim_stream(self, stream_id: str, token: str, lease_s: float) -> bool:
         """Whether ``token`` holds the claim, for ``lease_s`` seconds from now."""
@@ -95,7 +96,7 @@ class SqliteGridStore:
         await self._run(self._release_stream, stream_id, token)
 
     async def camera(self, name: str) -> bytes | None:
-        return await self._run(self._camera, name)
+        return await self._run(self._camera, name, reading=True)
 
     async def swap_camera(self, name: str, known: bytes | None, value: bytes | None) -> bool:
         return await self._run(self._swap_camera, name, known, value)
@@ -136,23 +137,35 @@ class SqliteGridStore:
             )
         return connection
 
-    async def _run(self, function: Callable[..., R], *args: Any) -> R:
-        return await asyncio.get_running_loop().run_in_executor(self._thread, self._transaction, function, args)
+    async def _run(self, function: Callable[..., R], *args: Any, reading: bool = False) -> R:
+        return await asyncio.get_running_loop().run_in_executor(
+            self._thread, self._transaction, function, args, reading
+        )
 
-    def _transaction(self, function: Callable[..., R], args: tuple[Any, ...]) -> R:
+    def _transaction(self, function: Callable[..., R], args: tuple[Any, ...], reading: bool) -> R:
+        """What ``function`` returns, once it is on disk; of one that only reads, even if its use cannot be noted."""
         try:
             self._connection.execute("BEGIN IMMEDIATE")
             try:
                 self._forget()
                 result = function(*args)
+                self._commit(reading)
             except BaseException:
                 if self._connection.in_transaction:
                     self._connection.execute("ROLLBACK")
                 raise
-            self._connection.execute("COMMIT")
         except sqlite3.Error as error:
             raise self._failed(error) from error
         return result
+
+    def _commit(self, reading: bool) -> None:
+        try:
+            self._connection.execute("COMMIT")
+        except sqlite3.OperationalError as error:
+            if not reading or error.sqlite_errorcode != sqlite3.SQLITE_FULL:
+                raise
+            if self._connection.in_transaction:
+                self._connection.execute("ROLLBACK")
 
     def _failed(self, error: sqlite3.Error) -> GridStoreUnavailable:
         return GridStoreUnavailable(f"The grid store failed: {error}.", setting="grid_store_path")
@@ -238,3 +251,9 @@ class SqliteGridStore:
         if count > self._entries:
             query = f"DELETE FROM {table} WHERE id IN (SELECT id FROM {table} ORDER BY used_at LIMIT ?)"
             self._connection.execute(query, (count - self._entries,))
+
+
+def _steady_clock() -> Callable[[], float]:
+    """Seconds since the epoch as they were when this was called, going on evenly."""
+    offset_s = time.time() - time.monotonic()
+    return lambda: offset_s + time.monotonic()
