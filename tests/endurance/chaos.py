@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.material import barrel_grid
 from benchmarks.serving import served
 from tests.endurance.checked_streams import CheckedStream
-from tests.endurance.verdict import Verdict
+from tests.endurance.verdict import TIMED_FROM_S, Verdict
 from tests.endurance.watching import Watched, wait_for
 
 KILL_EVERY_S = 5.0
@@ -38,7 +38,7 @@ STREAMS = [
 
 def run(seconds: float, renderer: str) -> Verdict:
     """Kills for ``seconds``, then stops workers while the streams go on, then a storm."""
-    verdict = Verdict("chaos")
+    verdict = Verdict("chaos", timed=seconds >= TIMED_FROM_S)
     random = Random(1)
     grid = barrel_grid()
     stop = threading.Event()
@@ -62,7 +62,7 @@ def run(seconds: float, renderer: str) -> Verdict:
             stream.join(120)
         _judge_streams(verdict, streams, kills_s, seconds)
         worst_s = max(replaced_s)
-        verdict.say(
+        verdict.say_time(
             f"{STOPS} workers stopped, replaced within {worst_s:.2f} s (at most {HANG_S:g} + 2)", worst_s <= HANG_S + 2
         )
         _judge_service(verdict, watched, len(streams), len(kills_s) + STOPS)
@@ -111,7 +111,7 @@ def _judge_streams(verdict: Verdict, streams: list[CheckedStream], kills_s: list
     verdict.say(f"{dropped} dropped by latest delivery, none by lossless", not any(t.dropped for t in lossless))
     stalls = [_longest_gap(tally.answered_s, kill_s) for tally in tallies for kill_s in kills_s]
     p99_s = float(np.quantile(stalls, 0.99))
-    verdict.say(
+    verdict.say_time(
         f"stall after a kill: median {np.median(stalls):.2f} s, p99 {p99_s:.2f} s (under {STALL_BAR_S:g}), "
         f"most {max(stalls):.2f} s",
         p99_s < STALL_BAR_S,

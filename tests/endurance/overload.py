@@ -13,7 +13,7 @@ import numpy as np
 import unbend
 from benchmarks.material import barrel_grid, jpeg, photograph
 from benchmarks.serving import served
-from tests.endurance.verdict import Verdict
+from tests.endurance.verdict import TIMED_FROM_S, Verdict
 from tests.endurance.watching import Watched, wait_for
 
 FACTOR = 3.0
@@ -35,7 +35,7 @@ class Arrivals:
 
 def run(seconds: float, renderer: str) -> Verdict:
     """Measures what the service can do, how long a call takes at a third of it, and then at three times of it."""
-    verdict = Verdict("overload")
+    verdict = Verdict("overload", timed=seconds >= TIMED_FROM_S)
     body = jpeg(photograph(1280, 720))
     with served(renderer=renderer, workers=2, queue_frames=QUEUE_FRAMES) as service:
         watched = Watched(service)
@@ -57,13 +57,13 @@ def run(seconds: float, renderer: str) -> Verdict:
         f"{storm.without_pause} rejected without Retry-After",
         bool(storm.accepted_s and storm.rejected_s) and not storm.failures and not storm.without_pause,
     )
-    verdict.say(
+    verdict.say_time(
         f"rejects answered: median {np.median(storm.rejected_s or [9.0]) * 1e3:.0f} ms, p99 {rejected_s * 1e3:.0f} ms "
         f"(under {REJECTED_BAR_S * 1e3:.0f})",
         rejected_s < REJECTED_BAR_S,
     )
     ratio = accepted_s / unloaded_s
-    verdict.say(
+    verdict.say_time(
         f"accepted p99 {accepted_s * 1e3:.0f} ms, {ratio:.1f} times the {unloaded_s * 1e3:.0f} ms at a third of "
         f"the load (at most {ACCEPTED_BAR:g})",
         ratio <= ACCEPTED_BAR,
