@@ -85,6 +85,11 @@ bench-summary: setup-dev  ## Write the results into benchmarks/README.md
 
 .PHONY: bench bench-summary bench-memory $(BENCHES)
 
+scale-demo: setup-dev  ## Two replicas, Redis and HAProxy: one killed, both restarted, Redis away for 20 s
+	$(BIN)/python -m benchmarks scale-demo
+
+.PHONY: scale-demo
+
 TRAINING = OMP_NUM_THREADS=1 $(BIN)/python -m training --photos $(PHOTOS)
 
 train: $(VENV)/.training  ## Go on with the long training run (training/README.md); stop it with Ctrl-C

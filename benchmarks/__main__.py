@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from benchmarks import estimate, http_load, memory, parity, render, scale, startup, stream, summary
+from benchmarks import estimate, http_load, memory, parity, render, scale, scale_demo, startup, stream, summary
 
 SUITES = {
     "render": render,
@@ -24,6 +24,7 @@ def main() -> int:
     suites = parser.add_subparsers(dest="suite", required=True)
     parity.add_arguments(suites.add_parser("parity", help=parity.__doc__))
     summary.add_arguments(suites.add_parser("summary", help=summary.__doc__))
+    scale_demo.add_arguments(suites.add_parser("scale-demo", help=scale_demo.__doc__))
     for name, suite in SUITES.items():
         options = suites.add_parser(name, help=suite.__doc__)
         options.add_argument("--json", type=Path, help="file for the results")
@@ -34,6 +35,8 @@ def main() -> int:
         return parity.run(arguments)
     if arguments.suite == "summary":
         return summary.run(arguments)
+    if arguments.suite == "scale-demo":
+        return scale_demo.run(arguments)
     report = SUITES[arguments.suite].run(arguments)
     if arguments.json is not None:
         report.write(arguments.json)

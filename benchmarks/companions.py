@@ -6,6 +6,7 @@ import shutil
 import signal
 import socket
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -31,7 +32,8 @@ class Companion:
     """
 
     def __init__(self, command: list[str], port: int, log: Path, environment: dict[str, str] | None = None) -> None:
-        found = shutil.which(command[0]) or shutil.which(command[0], path="/usr/sbin:/usr/local/sbin")
+        places = (None, str(Path(sys.executable).parent), "/usr/sbin:/usr/local/sbin")
+        found = next(filter(None, (shutil.which(command[0], path=place) for place in places)), None)
         if found is None:
             raise MissingProgram(f"{command[0]} is not installed (Debian: apt-get install {command[0]})")
         self._command = [found, *command[1:]]
