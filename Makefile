@@ -66,7 +66,7 @@ docs: setup-dev  ## Write the tables of settings in README.md and docs/configura
 .PHONY: docs
 
 MACHINE ?= $(shell hostname)
-BENCHES := bench-render bench-stream bench-http bench-estimate bench-startup bench-scale
+BENCHES := bench-render bench-stream bench-http bench-estimate bench-startup bench-scale bench-replicas
 
 $(BENCHES) bench-memory: bench-%: setup-dev
 	$(BIN)/python -m benchmarks $* --json benchmarks/results/$(MACHINE)/$*.json
@@ -77,6 +77,7 @@ bench-http:  ## Measure HTTP beside the same work in process
 bench-estimate:  ## Measure round trips of estimates
 bench-startup:  ## Measure the start of the service and the import of the client
 bench-scale:  ## Measure sizes from 256 x 256 to 7680 x 4320, and up to 10,000 grids
+bench-replicas:  ## Measure 1, 2 and 4 replicas behind HAProxy: cost of a frame, spread, failover
 bench-memory:  ## Watch the memory of every process for 30 minutes of mixed load
 bench: $(BENCHES) bench-summary  ## Measure everything
 

@@ -6,7 +6,19 @@ import argparse
 import sys
 from pathlib import Path
 
-from benchmarks import estimate, http_load, memory, parity, render, scale, scale_demo, startup, stream, summary
+from benchmarks import (
+    estimate,
+    http_load,
+    memory,
+    parity,
+    render,
+    replicas,
+    scale,
+    scale_demo,
+    startup,
+    stream,
+    summary,
+)
 
 SUITES = {
     "render": render,
@@ -15,6 +27,7 @@ SUITES = {
     "startup": startup,
     "stream": stream,
     "scale": scale,
+    "replicas": replicas,
     "memory": memory,
 }
 

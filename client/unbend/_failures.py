@@ -29,13 +29,19 @@ BY_STATUS: dict[grpc.StatusCode, type[errors.UnbendError]] = {
     grpc.StatusCode.UNAUTHENTICATED: errors.Refused,
 }
 
+#: What proxies make of a server that vanished in the middle of a call. The service itself answers with a request id.
+_OF_PROXIES = (grpc.StatusCode.UNKNOWN, grpc.StatusCode.INTERNAL)
+
 
 def translate(error: Any) -> errors.UnbendError:
     """The error of a call that failed, a ``grpc.RpcError`` that is also a ``grpc.Call``."""
-    plain = {key: value for key, value in error.trailing_metadata() or () if key.startswith("unbend-error-")}
+    trailing = dict(error.trailing_metadata() or ())
+    plain = {key: value for key, value in trailing.items() if key.startswith("unbend-error-")}
     code = plain.get("unbend-error-code")
     if code is None:
-        return BY_STATUS[error.code()](error.details() or error.code().name)
+        broken = error.code() in _OF_PROXIES and "x-request-id" not in trailing
+        kind = errors.Unreachable if broken else BY_STATUS[error.code()]
+        return kind(error.details() or error.code().name)
     retry_after_s = plain.get("unbend-error-retry-after-s")
     translated = errors.BY_CODE.get(code, errors.UnbendError)(
         unquote(plain.get("unbend-error-message", code)),

@@ -25,10 +25,18 @@ def test_every_status_has_its_line_in_the_table() -> None:
 
 @pytest.mark.parametrize("code", list(BY_STATUS))
 def test_a_status_without_a_code_of_ours_has_a_type_too(code: grpc.StatusCode) -> None:
-    error = translate(failed(code, "Something."))
+    error = translate(failed(code, "Something.", (("x-request-id", "7"),)))
 
     assert type(error) is BY_STATUS[code]
     assert "Something." in str(error)
+
+
+@pytest.mark.parametrize("code", [grpc.StatusCode.UNKNOWN, grpc.StatusCode.INTERNAL])
+def test_a_server_that_vanished_behind_a_proxy_is_unreachable(code: grpc.StatusCode) -> None:
+    """Envoy resets the stream, which says as little as a fault does; but whoever vanished gave no request id."""
+    error = translate(failed(code, "Stream removed (Received RST_STREAM with error code 2)"))
+
+    assert type(error) is unbend.Unreachable
 
 
 @pytest.mark.parametrize("kind", list(STATUS_CODES))
