@@ -105,8 +105,8 @@ export: $(VENV)/.training  ## Cool the run down for half an hour, calibrate it, 
 	$(TRAINING) calibrate
 	$(TRAINING) export --calibration $(HOME)/.cache/unbend/training/run-cooled-calibration.json
 
-evaluate: $(VENV)/.training  ## Print the accuracy tables of the default model over the validation photographs
-	$(TRAINING) evaluate --weights service/unbend_service/models/lineset.onnx --limit 150 --threshold 0.8
+evaluate: setup  ## Measure the models over the validation photographs of PHOTOS, beside peers: evaluation/report.md
+	$(BIN)/unbend eval --photos $(PHOTOS) --model lineset --model first --peers
 
 .PHONY: train train-smoke export evaluate
 

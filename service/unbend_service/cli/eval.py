@@ -15,9 +15,10 @@ from unbend_service.domain.errors import InvalidOption
 from unbend_service.evaluation.cases import Photograph, read_photographs
 from unbend_service.evaluation.chessboards import OPENCV_DOC
 from unbend_service.evaluation.families import FAMILIES
-from unbend_service.evaluation.methods import Method, doing_nothing, model_method
+from unbend_service.evaluation.figures import Gallery
+from unbend_service.evaluation.methods import Method, model_method, peer_methods
 from unbend_service.evaluation.report import REPORT, Evaluation
-from unbend_service.evaluation.suites import OBLIQUE, SUITES, run_suite
+from unbend_service.evaluation.suites import OBLIQUE, SUITES, SYNTHETIC, run_suite
 
 _FACADES = "facades_spb"
 
@@ -32,7 +33,8 @@ def evaluate(
     facades: Annotated[str, typer.Option(help="Source in index.csv of the oblique suite's photographs.")] = _FACADES,
     scenes: Annotated[Path | None, typer.Option(help="More straight pictures for the oblique suite.")] = None,
     chessboards: Annotated[Path, typer.Option(help="left01.jpg, right01.jpg ... of two real cameras.")] = OPENCV_DOC,
-    peers: Annotated[bool, typer.Option(help="Measure peers and do-nothing beside the models.")] = False,
+    show: Annotated[str, typer.Option(help="Sources whose photographs may appear in figures.")] = _FACADES,
+    peers: Annotated[bool, typer.Option(help="Also measure doing nothing, peers, floors and the true map.")] = False,
     out: Annotated[Path, typer.Option(help="Folder for the page, its figures and all measurements.")] = Path(
         "evaluation"
     ),
@@ -46,12 +48,13 @@ def evaluate(
         estimators = [load_estimator(name, usable_cores()) for name in model or ["lineset"]]
         methods: list[Method] = [model_method(estimator) for estimator in estimators]
         if peers:
-            methods.append(doing_nothing())
+            methods += peer_methods(estimators[0])
         photographs = read_photographs(photos, limit)
         evaluation = Evaluation(
             f"{len(photographs)} photographs of {photos.name}",
             {estimator.model.name: estimator.model.sha256 for estimator in estimators},
         )
+        evaluation.gallery = Gallery(frozenset(show.split(",")))
         for name in chosen:
             evaluation.measured[name] = run_suite(
                 name,
@@ -61,6 +64,7 @@ def evaluate(
                 per_camera=per_camera,
                 chessboards=chessboards,
                 scenes=None if scenes is None else read_photographs(scenes, limit),
+                witness=evaluation.gallery.see if name == SYNTHETIC else None,
             )
         evaluation.write(out)
     console.print(Markdown(evaluation.markdown()) if console.is_terminal else evaluation.markdown(), markup=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from unbend_service.domain.errors import InvalidOption
-from unbend_service.domain.maps import BackwardMap, target_lattice
+from unbend_service.domain.maps import BackwardMap, pixel_centres, target_lattice
 
 Bytes = npt.NDArray[np.uint8]
 Float64 = npt.NDArray[np.float64]
@@ -31,12 +32,14 @@ class Case:
         picture: grey uint8 (height, width), what a model is shown.
         truth: target -> source, centred; NaN or far outside where a target has no source.
         original: grey uint8 of the same size, what a perfect correction would show; None where there is none.
+        source: of the photograph.
     """
 
     group: str
     picture: Bytes
     truth: BackwardMap
     original: Bytes | None = None
+    source: str = ""
 
     @property
     def half_px(self) -> Float64:
@@ -47,6 +50,18 @@ class Case:
 
     def correspondences(self) -> tuple[Float64, Float64]:
         """Evenly spread target points whose source lies in the picture, and that source: both (n, 2), centred."""
+        return self._correspondences
+
+    @cached_property
+    def shown(self) -> npt.NDArray[np.bool_]:
+        """(height, width): pixels of the target whose source lies in the picture."""
+        height, width = self.picture.shape
+        source = self.truth(np.stack(np.meshgrid(pixel_centres(width), pixel_centres(height)), -1))
+        with np.errstate(invalid="ignore"):
+            return np.asarray((np.abs(source) <= 1 - 1 / np.array([width, height])).all(-1))
+
+    @cached_property
+    def _correspondences(self) -> tuple[Float64, Float64]:
         target = target_lattice(LATTICE_POINTS, LATTICE_POINTS, 1 - 1 / LATTICE_POINTS).reshape(-1, 2)
         source = self.truth(target)
         with np.errstate(invalid="ignore"):

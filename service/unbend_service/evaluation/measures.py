@@ -34,9 +34,11 @@ def map_errors(backward: BackwardMap, target: Float64, truth: Float64, half_px: 
 def as_rendered(grid: Grid) -> BackwardMap:
     """The grid as the public evaluation reads it: bilinear inside the frame, moved along with its edge outside."""
 
+    lattice = grid.continued(1.0)
+
     def backward(target: Float64) -> Float64:
         inside = np.clip(target, -1, 1)
-        return np.asarray(grid(inside) + (target - inside))
+        return np.asarray(lattice(inside) + (target - inside))
 
     return backward
 

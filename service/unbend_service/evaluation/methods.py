@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -13,9 +14,12 @@ from unbend_service.domain.decision import decide
 from unbend_service.domain.grid import Grid
 from unbend_service.domain.guides import Guides
 from unbend_service.domain.records import Correct, Outcome
-from unbend_service.evaluation.cases import Bytes, Case
+from unbend_service.evaluation.cases import Case
+from unbend_service.evaluation.peers import PlumblinePeer, floor_of, one_radial_parameter
 
 GRID_POINTS = 65
+FLOORS = ((2, 3), (4, 3), (4, 5), (6, 5))
+"""Guides a direction and their degree: the paper's, and finer ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,15 +78,34 @@ def model_method(estimator: Estimator, name: str | None = None) -> Method:
     return Method(name or estimator.model.name, look, threshold)
 
 
-def guides_method(name: str, examine: Callable[[Bytes], Guides]) -> Method:
+def guides_method(name: str, examine: Callable[[Case], Guides]) -> Method:
     """A peer that answers with guides and never says no."""
 
     def look(case: Case) -> Look:
         started = time.perf_counter()
-        guides = examine(case.picture)
+        guides = examine(case)
         return _decided(guides, 1.0, 0.0, None, time.perf_counter() - started)
 
     return Method(name, look, 0.0)
+
+
+def peer_methods(estimator: Estimator) -> list[Method]:
+    """Doing nothing, the plumb-line, one radial parameter (of this model's answers), the floors and the true map."""
+    plumbline = PlumblinePeer()
+    floors = [
+        guides_method(f"floor: {count} guides of degree {degree}", partial(floor_of, count, degree))
+        for count, degree in FLOORS
+    ]
+    return [
+        doing_nothing(),
+        guides_method("plumb-line", lambda case: plumbline.examine(case.picture)),
+        guides_method(
+            f"one radial parameter of {estimator.model.name}",
+            lambda case: one_radial_parameter(estimator, case.picture),
+        ),
+        *floors,
+        knowing_the_truth(),
+    ]
 
 
 def doing_nothing() -> Method:
@@ -94,7 +117,9 @@ def knowing_the_truth() -> Method:
     """The true map on the service's lattice: what a perfect estimate would reach."""
 
     def look(case: Case) -> Look:
-        grid = Grid.from_map(lambda target: np.nan_to_num(case.truth(target), nan=8.0).clip(-8, 8), 65, 65)
+        grid = Grid.from_map(
+            lambda target: np.nan_to_num(case.truth(target), nan=8.0).clip(-8, 8), GRID_POINTS, GRID_POINTS
+        )
         return Look(None, grid, grid, 1.0, True, 0.0, 0.0)
 
     return Method("the true map", look, 0.0)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from unbend_service.evaluation import suites, tables
+from unbend_service.evaluation.figures import Gallery, reliability_plot, threshold_plot
 from unbend_service.evaluation.lenses import is_straight
 from unbend_service.evaluation.suites import Measurement
 
@@ -19,6 +20,7 @@ _TITLES = {
     suites.NO_HARM: "Undistorted photographs",
     suites.REAL_LENSES: "Real lenses",
     suites.OBLIQUE: "Oblique and upright views",
+    suites.TABLE_ONE: "The paper's first table",
 }
 
 
@@ -29,12 +31,15 @@ class Evaluation:
     Attributes:
         photographs: how many, and of which folder.
         models: name -> SHA-256 of the weights.
+        gallery: pictures of the first model's best and worst answers.
+        figures: file names of the figures, once written.
     """
 
     photographs: str
     models: dict[str, str]
     measured: dict[str, dict[str, list[Measurement]]] = field(default_factory=dict)
-    sections: list[str] = field(default_factory=list)
+    gallery: Gallery | None = None
+    figures: list[str] = field(default_factory=list)
 
     def markdown(self) -> str:
         """The whole page."""
@@ -46,9 +51,12 @@ class Evaluation:
         ]
         for suite, by_method in self.measured.items():
             parts.append(f"## {_TITLES[suite]}\n")
+            if suite == suites.TABLE_ONE:
+                parts.append(tables.quality_table(by_method))
+                continue
             for method, measurements in by_method.items():
                 parts.append(f"### {method}\n\n{self._table(suite, method, measurements)}")
-        parts += self.sections
+        parts += [f"![{name.split('.')[0]}]({name})\n" for name in self.figures]
         if self.models:
             parts.append("## Weights\n\n| model | SHA-256 |\n|---|---|")
             parts[-1] += "".join(f"\n| {name} | `{digest}` |" for name, digest in self.models.items()) + "\n"
@@ -64,6 +72,26 @@ class Evaluation:
             return tables.no_harm_table(measurements, bent)
         return tables.family_table(measurements)
 
+    def _draw(self, folder: Path) -> None:
+        """Curves of the models (peers have no confidence), and the sheets."""
+        self.figures = []
+        synthetic, undistorted = (
+            {name: own for name, own in self.measured.get(suite, {}).items() if name in self.models}
+            for suite in (suites.SYNTHETIC, suites.NO_HARM)
+        )
+        curves = {}
+        if synthetic and undistorted:
+            both = {name: [*synthetic[name], *undistorted[name]] for name in synthetic}
+            curves = {
+                "reliability.svg": reliability_plot(both),
+                "threshold.svg": threshold_plot(undistorted, synthetic),
+            }
+        for name, text in curves.items():
+            (folder / name).write_text(text, encoding="utf-8")
+            self.figures.append(name)
+        if self.gallery is not None:
+            self.figures += [f"{name}.jpg" for name in self.gallery.write(folder)]
+
     def summary(self) -> dict[str, Any]:
         """Method -> the handful of figures that a target can be set for."""
         found: dict[str, dict[str, float]] = {}
@@ -74,6 +102,7 @@ class Evaluation:
 
     def write(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
+        self._draw(folder)
         (folder / REPORT).write_text(self.markdown(), encoding="utf-8")
         results = {
             "photographs": self.photographs,
@@ -110,6 +139,8 @@ def _figures(suite: str, measurements: list[Measurement]) -> dict[str, float]:
             "undistorted_unmoved": float((moved < tables.MOVED_PX).mean()),
             "undistorted_p95_px": float(np.percentile(moved, 95)),
         }
+    if suite == suites.TABLE_ONE:
+        return {}
     figures = {}
     for family, own in tables.groups(measurements).items():
         figures[f"all_{family}_px"] = float(np.mean([m.error_px for m in own]))

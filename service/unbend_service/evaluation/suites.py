@@ -6,19 +6,22 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
+from unbend_service.domain.dense_maps import pixel_maps
+from unbend_service.domain.grid import Grid
 from unbend_service.domain.maps import target_lattice
 from unbend_service.evaluation.cases import Bytes, Case, Float64, Photograph, grey_of, reduced
 from unbend_service.evaluation.chessboards import chessboard_cases, has_chessboards
-from unbend_service.evaluation.families import FAMILIES, family_cases
+from unbend_service.evaluation.families import FAMILIES, family_cases, table_one_cases
 from unbend_service.evaluation.lenses import lens_cases
 from unbend_service.evaluation.measures import as_rendered, displacement_px, map_errors, ssim_and_mse
 from unbend_service.evaluation.methods import Look, Method
 from unbend_service.evaluation.oblique import oblique_cases
 
-SYNTHETIC, NO_HARM, REAL_LENSES, OBLIQUE = "synthetic", "no-harm", "real-lenses", "oblique"
-SUITES = (SYNTHETIC, NO_HARM, REAL_LENSES, OBLIQUE)
+SYNTHETIC, NO_HARM, REAL_LENSES, OBLIQUE, TABLE_ONE = "synthetic", "no-harm", "real-lenses", "oblique", "table-1"
+SUITES = (SYNTHETIC, NO_HARM, REAL_LENSES, OBLIQUE, TABLE_ONE)
 _WHOLE_LONG_SIDE_PX = 512
 
 
@@ -92,32 +95,42 @@ def run_suite(
         cases = _real_lenses(photographs, per_camera, chessboards)
     elif name == OBLIQUE:
         cases = oblique_cases(photographs + (scenes or []))
+    elif name == TABLE_ONE:
+        cases = table_one_cases(photographs)
     else:
         raise ValueError(f"There is no suite {name!r}.")
     measured: dict[str, list[Measurement]] = {method.name: [] for method in methods}
     for number, case in enumerate(cases):
+        nothing = errors_of_nothing(case)
         for method in methods:
             look = method.look(case)
-            measurement = measure(case, look, number, quality=quality and name == SYNTHETIC)
+            measured_here = quality and name in (SYNTHETIC, TABLE_ONE)
+            measurement = measure(case, look, number, quality=measured_here, nothing=nothing)
             measured[method.name].append(measurement)
             if witness is not None and method is methods[0]:
                 witness(case, look, measurement)
     return measured
 
 
-def measure(case: Case, look: Look, number: int = 0, *, quality: bool = True) -> Measurement:
-    """What one look at one case is worth."""
+def errors_of_nothing(case: Case) -> tuple[float, float]:
+    """EPE of doing nothing, px: of everything, and up to a homography."""
+    return map_errors(lambda points: points, *case.correspondences(), case.half_px)
+
+
+def measure(
+    case: Case, look: Look, number: int = 0, *, quality: bool = True, nothing: tuple[float, float] | None = None
+) -> Measurement:
+    """What one look at one case is worth; `nothing` spares working out again what doing nothing is worth."""
     target, truth = case.correspondences()
     half_px = case.half_px
     lens, everything = as_rendered(look.lens), as_rendered(look.everything)
-    nothing_px, lens_nothing_px = map_errors(lambda points: points, target, truth, half_px)
+    nothing_px, lens_nothing_px = nothing or errors_of_nothing(case)
     error_px = float(np.hypot(*((everything(target) - truth) * half_px).T).mean())
     _, lens_px = map_errors(lens, target, truth, half_px)
     ssim_nothing = ssim = mse_nothing = mse = None
     if quality and case.original is not None:
-        shown = _shown(case)
-        ssim_nothing, mse_nothing = ssim_and_mse(case.picture, case.original, shown)
-        ssim, mse = ssim_and_mse(rendered(case.picture, look), case.original, shown)
+        ssim_nothing, mse_nothing = ssim_and_mse(case.picture, case.original, case.shown)
+        ssim, mse = ssim_and_mse(rendered(case.picture, look.everything), case.original, case.shown)
     return Measurement(
         group=case.group,
         picture=number,
@@ -137,25 +150,12 @@ def measure(case: Case, look: Look, number: int = 0, *, quality: bool = True) ->
     )
 
 
-def rendered(picture: Bytes, look: Look) -> Bytes:
-    """The picture corrected with `correct=all`, the border continued."""
-    import cv2
-
-    from unbend_service.domain.dense_maps import pixel_maps
-
+def rendered(picture: Bytes, grid: Grid) -> Bytes:
+    """The grey picture corrected, its border continued."""
     height, width = picture.shape
-    map_x, map_y = pixel_maps(look.everything, width, height)
+    map_x, map_y = pixel_maps(grid, width, height)
     corrected = cv2.remap(picture, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(corrected, np.uint8)
-
-
-def _shown(case: Case) -> np.typing.NDArray[np.bool_]:
-    height, width = case.picture.shape
-    x, y = (np.arange(size) * 2 / size + 1 / size - 1 for size in (width, height))
-    source = case.truth(np.stack(np.meshgrid(x, y), -1))
-    limit = 1 - 1 / np.array([width, height])
-    with np.errstate(invalid="ignore"):
-        return np.asarray((np.abs(source) <= limit).all(-1))
 
 
 def _whole(photograph: Photograph) -> Case:

@@ -7,9 +7,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from training.peers import PlumblinePeer, straightest_division
 from unbend_service.adapters.estimators.chains import extract
 from unbend_service.adapters.estimators.radial_family import straighten
+from unbend_service.evaluation.peers import PlumblinePeer, straightest_division
 
 
 def _lines_through(division: float) -> npt.NDArray[np.uint8]:
