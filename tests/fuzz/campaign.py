@@ -17,7 +17,7 @@ from tests.fuzz.inputs import Inputs
 from tests.fuzz.seeds import grids
 from tests.fuzz.sending import Senders
 
-_CONNECTIONS = 32
+_CONNECTIONS = 48
 #: Memory that may come on top of what the first tenth of the inputs left behind.
 _GROWTH_BYTES = 192 << 20
 _LOOK_EVERY = 500
@@ -44,7 +44,7 @@ class Verdict:
         return (
             f"fuzz {'PASSED' if self.passed else 'FAILED'}: {sum(self.sent.values())} malformed inputs "
             f"({self.sent['http']} HTTP, {self.sent['grpc']} gRPC) in {self.seconds:.0f} s, "
-            f"{len(self.failures)} answered 5xx/INTERNAL/UNKNOWN, {self.deaths} deaths of the front, "
+            f"{len(self.failures)} answered 5xx/INTERNAL/UNKNOWN or not at all, {self.deaths} deaths of the front, "
             f"{self.decoders_replaced:.0f} decoders replaced, RSS of the front {self.warm_bytes >> 20} MiB warm, "
             f"{self.most_bytes >> 20} MiB at most (allowed {(self.warm_bytes + _GROWTH_BYTES) >> 20})"
         )

@@ -22,7 +22,42 @@ log = structlog.get_logger(__name__)
 _OURS = "/unbend.v1."
 _REQUEST_ID = "x-request-id"
 
+#: A reader who takes nothing for so long learns of the end of his stream from his own deadline.
+_WRITE_PATIENCE_S = 1.0
+
 Context = grpc.aio.ServicerContext[Any, Any]
+
+
+class SettlingContext:
+    """The context of a stream whose writes go through even when their writer is cancelled.
+
+    gRPC takes no status while a write is under way: the caller of a stream that ended in that moment would wait for
+    ever. Everything but writing and ending is the context's own.
+    """
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+        self._write: asyncio.Future[None] | None = None
+
+    async def write(self, message: Any) -> None:
+        """As the context's, one at a time."""
+        self._write = asyncio.ensure_future(self._context.write(message))
+        self._write.add_done_callback(_seen)
+        await asyncio.shield(self._write)
+
+    async def abort(self, *status: Any) -> Any:
+        """As the context's, once the last write is through, or its reader has had time enough."""
+        if self._write is not None and not self._write.done():
+            await asyncio.wait({self._write}, timeout=_WRITE_PATIENCE_S)
+        return await self._context.abort(*status)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._context, name)
+
+
+def _seen(write: asyncio.Future[None]) -> None:
+    if not write.cancelled():
+        write.exception()  # told to the writer, if he is still there
 
 
 class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg] # generic in its stubs only
@@ -65,13 +100,19 @@ class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg] # g
         stream: Any = handler.stream_stream
 
         async def converse(raws: Any, context: Any) -> None:
-            requests = parse_all(method, parser, raws)
-            await self._watched(name, request_id, context, stream(requests, context))
+            requests, settling = parse_all(method, parser, raws), SettlingContext(context)
+            await self._watched(name, request_id, settling, stream(requests, settling))
 
         return grpc.stream_stream_rpc_method_handler(converse, None, handler.response_serializer)
 
     async def _watched(
-        self, name: str, request_id: str, context: Context, work: Awaitable[Any], *, single: bool = False
+        self,
+        name: str,
+        request_id: str,
+        context: Context | SettlingContext,
+        work: Awaitable[Any],
+        *,
+        single: bool = False,
     ) -> Any:
         start = time.perf_counter()
 
