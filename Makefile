@@ -24,6 +24,10 @@ $(VENV)/.e2e: pyproject.toml $(CONSTRAINTS) $(VENV)/.dev
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS) --group e2e
 	@touch $@
 
+$(VENV)/.deploy: pyproject.toml $(CONSTRAINTS) $(VENV)/.dev
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS) --group deploy
+	@touch $@
+
 $(VENV)/.training: pyproject.toml $(VENV)/.dev
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS) --group training
 	@touch $@
@@ -52,6 +56,14 @@ proto: setup-dev  ## Generate client/unbend/v1 from proto/
 	$(BIN)/python proto/generate.py
 
 .PHONY: help setup setup-dev serve test e2e check proto
+
+check-deploy: $(VENV)/.deploy  ## Check image, compose, chart, rules and dashboard (Debian: prometheus, haproxy)
+	$(BIN)/python -m pytest -m "deploy or not deploy" tests/deploy
+
+verify-dashboard: setup-dev  ## Run every query of the dashboard against the real service and a real Prometheus
+	$(BIN)/python -m deploy.checks.dashboard
+
+.PHONY: check-deploy verify-dashboard
 
 PHOTOS ?= ../shared/photos
 

@@ -435,6 +435,16 @@ async def test_health_follows_the_readiness_of_the_service(rpc: Rpc) -> None:
     watch.cancel()
 
 
+async def test_a_service_that_drains_or_has_no_renderer_is_alive_and_must_not_be_restarted(rpc: Rpc) -> None:
+    health = health_pb2_grpc.HealthStub(rpc.channel)
+    rpc.pool.ready = False
+    await rpc.service.admission.drain(0)
+
+    assert (await health.Check(health_pb2.HealthCheckRequest())).status == health_pb2.HealthCheckResponse.NOT_SERVING
+    live = await health.Check(health_pb2.HealthCheckRequest(service="live"))
+    assert live.status == health_pb2.HealthCheckResponse.SERVING
+
+
 async def test_reflection_lists_the_services(rpc: Rpc) -> None:
     stub = reflection_pb2_grpc.ServerReflectionStub(rpc.channel)
     call = stub.ServerReflectionInfo(iter([reflection_pb2.ServerReflectionRequest(list_services="")]))
