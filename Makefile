@@ -58,7 +58,7 @@ proto: setup-dev  ## Generate client/unbend/v1 from proto/
 .PHONY: help setup setup-dev serve test e2e check proto
 
 check-deploy: $(VENV)/.deploy  ## Check image, compose, chart, rules and dashboard (Debian: prometheus, haproxy)
-	$(BIN)/python -m pytest -m "deploy or not deploy" tests/deploy
+	$(BIN)/python -m pytest -m deploy tests/deploy
 
 verify-dashboard: setup-dev  ## Run every query of the dashboard against the real service and a real Prometheus
 	$(BIN)/python -m deploy.checks.dashboard
