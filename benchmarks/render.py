@@ -41,13 +41,14 @@ class Pool:
         self._runner = asyncio.Runner()
         self._pool = WorkerPool(settings, PrometheusMeter())
         self._runner.run(self._pool.start())
-        self._runner.run(self._all_ready())
-        info = self._pool.state().renderer
-        self.device = info.device if info is not None else "unknown"
+        self.device = self._runner.run(self._all_ready())
 
-    async def _all_ready(self) -> None:
+    async def _all_ready(self) -> str:
+        """Waits for every worker; returns the device."""
         while any(worker.state == "starting" for worker in self._pool.state().workers):  # noqa: ASYNC110 no event says so
             await asyncio.sleep(0.05)
+        info = self._pool.state().renderer
+        return info.device if info is not None else "unknown"
 
     def one(self, frame: Frame, grid: Grid) -> None:
         """One frame, alone in the pool."""
