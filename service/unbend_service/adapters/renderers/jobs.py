@@ -16,6 +16,9 @@ from unbend_service.domain.frames import Border, Frame
 from unbend_service.domain.grid import Grid
 
 
+_FLOWS_REMEMBERED = 1024
+
+
 @dataclass(slots=True, eq=False)
 class Job:
     """One frame from acceptance to answer.
@@ -33,7 +36,7 @@ class Job:
         copied: whether the source is in the slot, or need not be.
         blame: grows with every worker that dies while it renders this very frame.
         passed_over: how often a later frame was taken first because it suited the worker.
-        due_bytes: its place in the queue, see JobQueue.
+        turn: its place in the queue, see JobQueue.
     """
 
     number: int
@@ -51,7 +54,7 @@ class Job:
     copied: bool = False
     blame: int = 0
     passed_over: int = 0
-    due_bytes: int = 0
+    turn: int = 0
 
     @property
     def size_bytes(self) -> int:
@@ -91,14 +94,15 @@ def preferred_worker(affinity: str | None, workers: int) -> int:
 class JobQueue:
     """Fair between flows, first in, first out within one; a worker may take a job that prefers it from further back.
 
-    Fair queueing by bytes: a job is due when its flow, had it an equal share of all that is drawn, would have had it
-    drawn. However much a flow has waiting, a frame of another is never behind more than one of its frames of that size.
+    Fair by frames: the next frame of a flow has its turn one round after the one before it, and no earlier than the
+    round that is drawn now. However much a flow has waiting, one of its frames at most goes before that of another.
+    Bytes are not weighed: all that a flow of large frames may have under way has to be drawn within the deadline too.
     """
 
     def __init__(self) -> None:
         self._jobs: list[Job] = []
-        self._drawn_bytes = 0
-        self._due_bytes: dict[str, int] = {}
+        self._round = 0
+        self._turns: dict[str, int] = {}
 
     def __len__(self) -> int:
         return len(self._jobs)
@@ -109,14 +113,15 @@ class JobQueue:
     def append(self, job: Job) -> None:
         """Puts a new job where its flow's turn is."""
         if not self._jobs:
-            self._drawn_bytes = 0
-            self._due_bytes.clear()
-        last_bytes = 0 if job.flow is None else self._due_bytes.get(job.flow, 0)
-        job.due_bytes = max(self._drawn_bytes, last_bytes) + job.size_bytes
+            self._round = 0
+            self._turns.clear()
+        if len(self._turns) > _FLOWS_REMEMBERED:
+            self._turns = {flow: turn for flow, turn in self._turns.items() if turn > self._round}
+        job.turn = self._round + 1
         if job.flow is not None:
-            self._due_bytes[job.flow] = job.due_bytes
+            job.turn = self._turns[job.flow] = max(self._round, self._turns.get(job.flow, 0)) + 1
         place = len(self._jobs)
-        while place and self._jobs[place - 1].due_bytes > job.due_bytes:
+        while place and self._jobs[place - 1].turn > job.turn:
             place -= 1
         self._jobs.insert(place, job)
 
@@ -129,7 +134,7 @@ class JobQueue:
         if job not in self._jobs:
             return False
         self._jobs.remove(job)
-        self._drawn_bytes = max(self._drawn_bytes, job.due_bytes - job.size_bytes)
+        self._round = max(self._round, job.turn - 1)
         return True
 
     def pick(self, able: Collection[int], workers: int) -> tuple[Job, int | None]:
