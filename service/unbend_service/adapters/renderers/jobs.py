@@ -15,7 +15,6 @@ from unbend_service.application.ports import Bytes, SharedPicture
 from unbend_service.domain.frames import Border, Frame
 from unbend_service.domain.grid import Grid
 
-
 _FLOWS_REMEMBERED = 1024
 
 
