@@ -128,8 +128,11 @@ async def _drain(
     await asyncio.sleep(notice_s)
     finished = await service.admission.drain(settings.drain_s)
     http_server.should_exit = True
-    await asyncio.gather(rpc_server.stop(_LAST_BYTES_S), serving)
-    log.info("stopped", finished=finished)
+    stopping = asyncio.ensure_future(rpc_server.stop(_LAST_BYTES_S))
+    ends: set[asyncio.Future[Any]] = {stopping, serving}
+    # the library may wait for a call that was cancelled at its deadline; nothing accepted is left by now
+    _, left = await asyncio.wait(ends, timeout=_LAST_BYTES_S + 2)
+    log.info("stopped", finished=finished, transports_left=len(left))
 
 
 def _end_at_last(patience_s: float) -> None:

@@ -48,8 +48,8 @@ class Server:
         return [child for child in psutil.Process(self.process.pid).children(recursive=True) if child.pid in pids]
 
 
-def start_server(**settings: str) -> Server:
-    """Starts ``unbend serve`` and waits until it says that it is ready."""
+def start_server(*, before: tuple[str, ...] = (), **settings: str) -> Server:
+    """Starts ``unbend serve`` and waits until it says that it is ready; ``before`` is a command that executes it."""
     environment = os.environ | {
         "UNBEND_HTTP_PORT": "0",
         "UNBEND_GRPC_PORT": "0",
@@ -57,7 +57,7 @@ def start_server(**settings: str) -> Server:
         **{f"UNBEND_{name.upper()}": value for name, value in settings.items()},
     }
     process = subprocess.Popen(
-        [sys.executable, "-m", "unbend", "serve"], env=environment, stderr=subprocess.PIPE, text=True
+        [*before, sys.executable, "-m", "unbend", "serve"], env=environment, stderr=subprocess.PIPE, text=True
     )
     server = Server(process)
     ready = threading.Event()

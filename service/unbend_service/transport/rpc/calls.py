@@ -11,7 +11,6 @@ from typing import Any
 import grpc
 import structlog
 
-from unbend_service.application.deadlines import deadline
 from unbend_service.application.service import Service
 from unbend_service.domain.errors import UnbendError
 from unbend_service.transport.rpc.messages import parse, parse_all
@@ -121,7 +120,7 @@ class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg] # g
 
         try:
             with structlog.contextvars.bound_contextvars(request_id=request_id, method=name):
-                result, status = await self._outcome(work, context.time_remaining(), single)
+                result, status = await self._outcome(work, single)
         except asyncio.CancelledError:
             count(grpc.StatusCode.CANCELLED)
             raise
@@ -132,14 +131,13 @@ class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg] # g
         count(status.code)
         return await context.abort(status.code, status.message, (*status.trailing_metadata, (_REQUEST_ID, request_id)))
 
-    async def _outcome(self, work: Awaitable[Any], left_s: float | None, single: bool) -> tuple[Any, Status | None]:
-        """What a call returned, or the status that it ends with; whatever it does is given up after ``left_s``."""
+    async def _outcome(self, work: Awaitable[Any], single: bool) -> tuple[Any, Status | None]:
+        """What a call returned, or the status that it ends with; at the caller's deadline grpc cancels it."""
         admitted = False
         try:
             with self._service.admission.admitted(single=single):
                 admitted = True
-                async with deadline(left_s):
-                    return await work, None
+                return await work, None
         except UnbendError as error:
             if not admitted:
                 self._service.meter.rejected(error.code)
