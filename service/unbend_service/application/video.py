@@ -35,9 +35,15 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Passenger:
-    """A packet of sound, subtitles or the like, which is copied as it is; the reader's and the writer's own."""
+    """A packet that is copied as it is: sound, subtitles, or a video that is left alone.
+
+    Attributes:
+        packet: the reader's and the writer's own.
+        is_picture: whether it belongs to the video itself.
+    """
 
     packet: object
+    is_picture: bool = False
 
 
 class VideoReader(Protocol):
@@ -139,6 +145,34 @@ async def correct_video(
             entry = under_way.get_nowait()
             if entry is not None and entry[1] is not None:
                 entry[1].cancel()
+    return progress.frames
+
+
+async def copy_video(
+    reader: VideoReader,
+    writer: VideoWriter,
+    *,
+    ahead: Sequence[Passenger],
+    progress: Progress,
+) -> int:
+    """Copies a video whose pictures stay as they are, packet by packet, until the end or ``progress.stop``.
+
+    Returns:
+        Pictures written.
+
+    Raises:
+        Whatever reader and writer raise.
+    """
+
+    def copy(items: Sequence[Picture | Passenger]) -> None:
+        for item in items:
+            if isinstance(item, Passenger):
+                writer.write_passenger(item)
+                progress.frames += item.is_picture
+
+    await asyncio.to_thread(copy, ahead)
+    while not progress.stop and (items := await asyncio.to_thread(reader.read)):
+        await asyncio.to_thread(copy, items)
     return progress.frames
 
 

@@ -16,6 +16,7 @@ from unbend_service.cli.grid_source import record_of, translated
 from unbend_service.cli.private import private_service
 from unbend_service.domain.errors import InvalidFrame
 from unbend_service.domain.frames import Bytes, Frame
+from unbend_service.domain.orientation import Orientation
 from unbend_service.domain.records import GridRecord
 from unbend_service.settings import Settings
 
@@ -39,15 +40,25 @@ class PrivateBackend:
     def __init__(self, service: Service) -> None:
         self._service = service
 
-    async def prepare(self, samples: Sequence[Frame], given: GridRecord | None, options: CorrectOptions) -> Prepared:
-        """Fixes the grid: ``given``, or one that is estimated over ``samples``."""
+    async def prepare(
+        self,
+        samples: Sequence[Frame],
+        given: GridRecord | None,
+        options: CorrectOptions,
+        orientation: Orientation,
+    ) -> Prepared:
+        """Fixes the grid: ``given``, or one that is estimated over ``samples``; both are of the pictures as shown.
+
+        Args:
+            orientation: how the frames that are drawn are shown.
+        """
         correction = self._service.correction
         record = given or await estimate_over(
             samples, self._service.estimation, self._service.blocking, options.correct, options.min_confidence
         )
         if leaves_alone(record):
             return Prepared(record, _unchanged, 4)
-        grid = await correction.fitted(record, options)
+        grid = orientation.stored(await correction.fitted(record, options))
 
         async def draw(frame: Frame) -> Bytes:
             return await correction.draw(frame, grid, options.border)
@@ -62,23 +73,27 @@ class ServerBackend:
         self._client = client
         self._server = server
 
-    async def prepare(self, samples: Sequence[Frame], given: GridRecord | None, options: CorrectOptions) -> Prepared:
+    async def prepare(
+        self,
+        samples: Sequence[Frame],
+        given: GridRecord | None,
+        options: CorrectOptions,
+        orientation: Orientation,
+    ) -> Prepared:
         """As :meth:`PrivateBackend.prepare`, by the server."""
         try:
-            if given is None:
-                record = await self._estimated(samples, options)
-            else:
-                await self._client.grids.put(unbend.Grid(given.grid.source))
-                record = given
+            record = given or await self._estimated(samples, options)
+            if leaves_alone(record):
+                return Prepared(record, _unchanged, 4)
+            drawn = orientation.stored(record.grid)
+            await self._client.grids.put(unbend.Grid(drawn.source))
         except unbend.UnbendError as error:
             raise translated(error, self._server) from error
-        if leaves_alone(record):
-            return Prepared(record, _unchanged, 4)
 
         async def draw(frame: Frame) -> Bytes:
             try:
                 answer = await self._client.correct(
-                    _array(frame), pixel_format="i420", grid=record.id, fit=str(options.fit), strength=options.strength
+                    _array(frame), pixel_format="i420", grid=drawn.id, fit=str(options.fit), strength=options.strength
                 )
             except unbend.UnbendError as error:
                 raise translated(error, self._server) from error

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import struct
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -10,15 +12,17 @@ from typing import Any
 
 import numpy as np
 
-from unbend_service.adapters.video.pyav import av_errors, load_av
+from unbend_service.adapters.video.pyav import av_errors, frame_of, load_av, picture_of
 from unbend_service.application.video import Passenger, Picture
 from unbend_service.domain.errors import InvalidImage
-from unbend_service.domain.frames import Frame, PixelFormat, frame_size_bytes
+from unbend_service.domain.frames import Frame
+from unbend_service.domain.orientation import Orientation
 
 STANDARD_INPUT = "-"
 _I420 = ("yuv420p", "yuvj420p")
 #: Broken packets in a row after which the input is given up.
 _MOST_BROKEN = 100
+_NETWORK_TIMEOUT_S = 20.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,10 +67,25 @@ class PyavReader:
             for stream in self.container.streams
             if stream.type in ("audio", "subtitle") and stream.codec_context is not None
         ]
-        self.rotation = 0
-        self._first: Sequence[Picture | Passenger] = ()
+        #: The display matrix of the pictures; known once one of them is, None if they have none.
+        self.display_matrix: tuple[int, ...] | None = None
+        self._looked = False
+        #: Whether the packets of the video, as far as they were read, can be put into another container.
+        self.can_copy = self.codec != "rawvideo"
         self._items = self._demuxed()
         self._broken = 0
+        self._copies_video = False
+        self._kept: list[Passenger] | None = None
+
+    @property
+    def codec(self) -> str:
+        """What the video is encoded as, by FFmpeg's name of the format (h264, hevc, ...)."""
+        return str(self.stream.codec_context.codec.canonical_name)
+
+    @property
+    def orientation(self) -> Orientation:
+        """How the pictures are to be shown; upright until one of them has been read or sampled."""
+        return Orientation() if self.display_matrix is None else Orientation.of_display_matrix(self.display_matrix)
 
     @property
     def frames_expected(self) -> int | None:
@@ -84,25 +103,56 @@ class PyavReader:
         with av_errors(f"{self.source} cannot be read"):
             return next(self._items, ())
 
+    def read_ahead(self, count: int) -> list[Picture | Passenger]:
+        """What comes until ``count`` pictures are there; :meth:`copy_video` can still take it back."""
+        self._kept = []
+        ahead: list[Picture | Passenger] = []
+        while sum(isinstance(item, Picture) for item in ahead) < count and (items := self.read()):
+            ahead += items
+        return ahead
+
+    def settle(self, *, copy: bool) -> list[Passenger]:
+        """Whether the video itself is read as packets from now on, and those packets that were read ahead."""
+        kept, self._kept = self._kept or [], None
+        self._copies_video = copy
+        return kept if copy else []
+
     def samples(self, count: int) -> list[Frame]:
-        """Up to ``count`` pictures spread over a file, read through a second opening of it; none of other inputs."""
+        """Up to ``count`` pictures spread over the video, through a second opening of it.
+
+        None of inputs that have no known end or cannot be sought in, such as pipes and cameras.
+        """
         duration = self.container.duration
-        if self.source == STANDARD_INPUT or "://" in self.source or not duration:
+        if self.source == STANDARD_INPUT or self.source.startswith("rtsp") or not duration:
             return []
         found: list[Frame] = []
         with av_errors(f"{self.source} cannot be read"), _opened(self._av, self.source) as container:
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
             start = container.start_time or 0
+            for packet in itertools.islice(container.demux(stream), count):
+                self._examine(packet)
             for share in (np.arange(count) + 0.5) / count:
                 try:
                     container.seek(int(start + duration * share), backward=True)
                     picture = next(container.decode(stream), None)
-                except (self._av.error.InvalidDataError, self._av.error.PermissionError):
+                except self._av.error.FFmpegError:  # no way to seek in it, or a broken place
                     continue
                 if picture is not None and (picture.width, picture.height) == (self.width, self.height):
                     found.append(self._frame(picture))
         return found
+
+    def as_shown(self, frame: Frame) -> Frame:
+        """A picture as a player shows it: upright, and with square pixels of the larger side's size."""
+        aspect = Fraction(self.stream.codec_context.sample_aspect_ratio or 1)
+        if aspect != 1:
+            width, height = frame.width, frame.height
+            if aspect > 1:
+                width = round(width * aspect / 2) * 2
+            else:
+                height = round(height / aspect / 2) * 2
+            frame = frame_of(picture_of(frame).reformat(width=width, height=height))
+        return self.orientation.shown(frame)
 
     def close(self) -> None:
         """Frees the decoder and the file."""
@@ -110,9 +160,15 @@ class PyavReader:
 
     def _demuxed(self) -> Iterator[Sequence[Picture | Passenger]]:
         for packet in self.container.demux([self.stream, *self.passengers]):
-            if packet.stream is not self.stream:
+            is_video = packet.stream is self.stream
+            passenger = Passenger(packet, is_video)
+            if is_video:
+                self._examine(packet)
+            if packet.dts is not None and self._kept is not None:
+                self._kept.append(passenger)
+            if not is_video or self._copies_video:
                 if packet.dts is not None:
-                    yield [Passenger(packet)]
+                    yield [passenger]
                 continue
             try:
                 pictures = packet.decode()
@@ -126,28 +182,30 @@ class PyavReader:
                 self._broken = 0
                 yield [self._picture(picture) for picture in pictures]
 
+    def _examine(self, packet: Any) -> None:
+        """Containers want to know when a packet is to be decoded and shown; cameras over RTP do not always say it."""
+        if packet.size and (packet.dts is None or packet.pts is None):
+            self.can_copy = False
+
     def _picture(self, picture: Any) -> Picture:
         if (picture.width, picture.height) != (self.width, self.height):
             raise InvalidImage(
                 f"The pictures change their size, from {self.width}x{self.height} to {picture.width}x{picture.height}."
             )
-        if picture.rotation:
-            self.rotation = int(picture.rotation)
         if picture.interlaced_frame:
             self._note("The video is interlaced; its pictures are corrected as if they were progressive.")
         return Picture(self._frame(picture), Timing(picture.pts, int(picture.duration or 0)))
 
     def _frame(self, picture: Any) -> Frame:
+        if not self._looked:
+            self._looked = True
+            matrix = picture.side_data.get("DISPLAYMATRIX")
+            self.display_matrix = None if matrix is None else struct.unpack("=9i", bytes(matrix))
         if picture.format.name not in _I420:
             deep = any(component.bits > 8 for component in picture.format.components)
             self._note(f"{picture.format.name} was converted to 8-bit 4:2:0{', losing depth' if deep else ''}.")
             picture = picture.reformat(format="yuv420p")
-        data = np.empty(frame_size_bytes(PixelFormat.I420, self.width, self.height), np.uint8)
-        frame = Frame(PixelFormat.I420, self.width, self.height, data)
-        for out, plane in zip(frame.plane_arrays(), picture.planes, strict=True):
-            rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
-            out[...] = rows[: out.shape[0], : out.shape[1]]
-        return frame
+        return frame_of(picture)
 
     def _note(self, text: str) -> None:
         if text not in self.notes:
@@ -158,4 +216,5 @@ def _opened(av: Any, source: str) -> Any:
     if source == STANDARD_INPUT:
         return av.open(sys.stdin.buffer, format="yuv4mpegpipe")
     options = {"rtsp_transport": "tcp"} if source.startswith("rtsp") else {}
-    return av.open(source, options=options, timeout=(20.0, 20.0) if "://" in source else None)
+    timeout = (_NETWORK_TIMEOUT_S, _NETWORK_TIMEOUT_S) if "://" in source else None
+    return av.open(source, options=options, timeout=timeout)

@@ -5,10 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from unbend_service.adapters.video.encoders import ENCODERS, VideoCodec, encoder_options
-from unbend_service.adapters.video.pyav import av_errors, load_av
+from unbend_service.adapters.video.pyav import av_errors, load_av, picture_of
 from unbend_service.adapters.video.reading import PyavReader, Timing
 from unbend_service.application.video import Passenger, Picture
 from unbend_service.domain.errors import InvalidOption
@@ -20,8 +18,8 @@ _MP4 = (".mp4", ".mov", ".m4v")
 class PyavWriter:
     """Port VideoWriter: a file whose video is encoded anew and whose other streams are copied.
 
-    Timestamps, colour description, aspect and rotation are those of ``reader``. The file is opened with the first
-    picture, whose size it takes.
+    Timestamps, colour description, aspect, orientation and chapters are those of ``reader``. The file is opened with
+    the first picture, whose size it takes, or by :meth:`copy_video`.
 
     Args:
         target: where to; the suffix chooses the container.
@@ -52,6 +50,25 @@ class PyavWriter:
                 f"OUT ends in {target.suffix!r}.", allowed=".mp4, .mov, .mkv, .webm, .avi, .ts"
             ) from error
 
+    def copy_video(self) -> bool:
+        """Opens the file for the packets of the video as they are: :meth:`write_passenger` takes them too.
+
+        Returns:
+            False, and nothing is done, if the container does not hold the codec of the input, or not its packets.
+        """
+        if not self._reader.can_copy:
+            return False
+        with av_errors(f"{self._target} cannot be written"):
+            container = self._created()
+            try:
+                stream = container.add_stream_from_template(self._reader.stream, opaque=True)
+            except ValueError:
+                container.close()
+                return False
+            self._copies[self._reader.stream.index] = stream
+            self._started(container, stream)
+        return True
+
     def write_picture(self, picture: Picture) -> None:
         """Encodes one picture."""
         with av_errors(f"{self._target} cannot be written"):
@@ -79,13 +96,13 @@ class PyavWriter:
         container, self._container = self._container, None
         with av_errors(f"{self._target} cannot be written"):
             try:
-                container.mux(self._stream.encode(None))
+                if self._reader.stream.index not in self._copies:
+                    container.mux(self._stream.encode(None))
             finally:
                 container.close()
 
     def _open(self, frame: Frame) -> None:
-        options = {"movflags": "+faststart"} if self._target.suffix.lower() in _MP4 else {}
-        container = self._av.open(str(self._target), "w", format=self._format_name(), options=options)
+        container = self._created()
         reader, encoder = self._reader, ENCODERS[self._codec]
         try:
             stream = container.add_stream(encoder.library, rate=reader.rate, options=self._options)
@@ -104,10 +121,20 @@ class PyavWriter:
             context.sample_aspect_ratio = source.sample_aspect_ratio
         if self._codec is VideoCodec.HEVC and self._target.suffix.lower() in _MP4:
             context.codec_tag = "hvc1"  # the tag that Apple's players ask for
-        if reader.rotation:
-            stream.set_display_rotation(reader.rotation)
+        self._started(container, stream)
+
+    def _created(self) -> Any:
+        options = {"movflags": "+faststart"} if self._target.suffix.lower() in _MP4 else {}
+        return self._av.open(str(self._target), "w", format=self._format_name(), options=options)
+
+    def _started(self, container: Any, stream: Any) -> None:
+        """What both ways of writing the video have in common: everything but its packets."""
+        reader = self._reader
+        if reader.display_matrix is not None:
+            stream.set_display_matrix(reader.display_matrix)
         stream.metadata.update(reader.stream.metadata)
         container.metadata.update(reader.container.metadata)
+        container.set_chapters(reader.container.chapters())
         self._container, self._stream = container, stream
         for passenger in reader.passengers:
             self._add_copy(passenger)
@@ -123,14 +150,11 @@ class PyavWriter:
             return
         copy = self._container.add_stream_from_template(passenger)
         copy.metadata.update(passenger.metadata)
+        copy.disposition = int(passenger.disposition)
         self._copies[passenger.index] = copy
 
     def _video_frame(self, picture: Picture) -> Any:
-        frame = picture.frame
-        out = self._av.VideoFrame(frame.width, frame.height, "yuv420p")
-        for samples, plane in zip(frame.plane_arrays(), out.planes, strict=True):
-            rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
-            rows[: samples.shape[0], : samples.shape[1]] = samples
+        out = picture_of(picture.frame)
         timing = picture.timing
         pts = timing.pts if isinstance(timing, Timing) else None
         step = max(1, round(1 / (self._reader.rate * self._reader.stream.time_base)))

@@ -7,8 +7,6 @@ from typing import BinaryIO
 
 from unbend_service.application.video import Passenger, Picture
 
-_FULL_RANGE = 2
-
 
 class Y4mWriter:
     """Port VideoWriter: 8-bit 4:2:0 at a constant rate, without sound.
@@ -16,13 +14,17 @@ class Y4mWriter:
     Args:
         out: where to; left open.
         rate: frames a second.
-        full_range: whether luma goes from 0 to 255.
+        full_range: whether luma goes from 0 to 255, as in JPEG.
+        aspect: width of a pixel by its height; None if nobody knows.
     """
 
-    def __init__(self, out: BinaryIO, rate: Fraction, *, full_range: bool = False) -> None:
+    def __init__(
+        self, out: BinaryIO, rate: Fraction, *, full_range: bool = False, aspect: Fraction | None = None
+    ) -> None:
         self._out = out
         self._rate = rate
         self._full_range = full_range
+        self._aspect = aspect or Fraction(0)
         self._started = False
         self.notes: list[str] = []
 
@@ -30,8 +32,10 @@ class Y4mWriter:
         frame = picture.frame
         if not self._started:
             rate = f"{self._rate.numerator}:{self._rate.denominator}"
-            colour = "FULL" if self._full_range else "LIMITED"
-            header = f"YUV4MPEG2 W{frame.width} H{frame.height} F{rate} Ip A0:0 C420jpeg XCOLORRANGE={colour}\n"
+            # where chroma lies: in the middle in JPEG, on the left in what else is 8-bit 4:2:0
+            colours = "C420jpeg XCOLORRANGE=FULL" if self._full_range else "C420mpeg2 XCOLORRANGE=LIMITED"
+            aspect = f"{self._aspect.numerator}:{self._aspect.denominator if self._aspect else 0}"
+            header = f"YUV4MPEG2 W{frame.width} H{frame.height} F{rate} Ip A{aspect} {colours}\n"
             self._out.write(header.encode())
             self._started = True
         self._out.write(b"FRAME\n")
@@ -42,6 +46,10 @@ class Y4mWriter:
         note = "Sound and subtitles were left out: y4m does not hold them."
         if note not in self.notes:
             self.notes.append(note)
+
+    def copy_video(self) -> bool:
+        """y4m holds no packets: its pictures are always written anew, which loses nothing."""
+        return False
 
     def close(self) -> None:
         self._out.flush()
