@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tests.fakes import FakeEstimator, FakeRenderPool, RecordingMeter
 from unbend_service.adapters.codecs.pillow import PillowCodec
-from unbend_service.adapters.drawing.overlay import OverlayIllustrator
+from unbend_service.adapters.drawing.figures import FigureIllustrator
 from unbend_service.adapters.exchange.files import ExchangeFiles
 from unbend_service.adapters.grid_stores.memory import MemoryGridStore
 from unbend_service.application.blocking import BlockingWork
@@ -46,7 +46,7 @@ def service_over_fakes(settings: Settings, store: MemoryGridStore | None = None)
     return Service(
         estimation=estimation,
         correction=correction,
-        illustration=Illustration(estimation, codec, store, OverlayIllustrator(), blocking, jpeg_quality=92),
+        illustration=Illustration(estimation, correction, codec, store, FigureIllustrator(), blocking, jpeg_quality=92),
         grids=library,
         exchange=Exchange(ExchangeFiles(), grids, blocking),
         streams=streams,

@@ -9,7 +9,7 @@ from unbend_service.adapters.cores import usable_cores
 from unbend_service.adapters.decoding.codec import IsolatedCodec
 from unbend_service.adapters.decoding.files import IsolatedFiles
 from unbend_service.adapters.decoding.pool import DecoderPool
-from unbend_service.adapters.drawing.overlay import OverlayIllustrator
+from unbend_service.adapters.drawing.figures import FigureIllustrator
 from unbend_service.adapters.estimators.catalogue import load_estimator
 from unbend_service.adapters.estimators.remote import RemoteEstimator
 from unbend_service.adapters.exchange.files import ExchangeFiles
@@ -131,7 +131,7 @@ def build_service(settings: Settings, meter: PrometheusMeter | None = None) -> S
         offered=settings.role != "estimate",
     )
     illustration = Illustration(
-        estimation, codec, store, OverlayIllustrator(), blocking, jpeg_quality=settings.jpeg_quality
+        estimation, correction, codec, store, FigureIllustrator(), blocking, jpeg_quality=settings.jpeg_quality
     )
     grids = GridLibrary(store, blocking, grid_points=settings.grid_points)
     exchange = Exchange(IsolatedFiles(decoders), fitted_grids, blocking)

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+import subprocess
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -43,18 +45,54 @@ def test_each_figure_is_a_picture(folder: Path, what: str) -> None:
     assert np.abs(figure[:240, :320].astype(int) - cv2.imread(str(folder / "in.png"))).max() > 20 or what == "sheet"
 
 
-@pytest.mark.parametrize(("what", "lines"), [("guides", 8), ("grid", 34)])
-def test_svg_holds_lines_that_can_be_scaled(folder: Path, what: str, lines: int) -> None:
-    """The photograph is embedded; each curve is a halo and a core."""
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+@pytest.mark.parametrize(
+    ("what", "pictures", "lines"),
+    [
+        ("guides", 1, 8),
+        ("grid", 1, 30),
+        ("grids", 2, 60),
+        ("displacement", 1, 150),
+        ("magnitude", 2, 6),
+        ("sheet", 4, 38),
+    ],
+)
+def test_svg_holds_lines_that_can_be_scaled(folder: Path, what: str, pictures: int, lines: int) -> None:
+    """Photographs are embedded; curves, arrows and words are vectors."""
     run(folder, str(folder / "out.svg"), "--what", what)
     tree = ElementTree.parse(folder / "out.svg")
-    name = "{http://www.w3.org/2000/svg}"
-    assert len(tree.findall(f".//{name}polyline")) == 2 * lines
-    assert len(tree.findall(f"{name}image")) == 1
+    assert len(tree.findall(f".//{SVG}image")) == pictures
+    assert len(tree.findall(f".//{SVG}polyline")) >= lines
+    words = [element.text for element in tree.findall(f".//{SVG}text")]
+    expected = {
+        "displacement": "px",
+        "magnitude": "px",
+        "sheet": "after",
+        "grids": "straightened",
+    }.get(what)
+    assert expected is None or any(expected in (word or "") for word in words), words
+
+
+@pytest.mark.parametrize("what", ["guides", "grid", "grids", "displacement", "magnitude", "sheet"])
+def test_a_browser_draws_the_svg_as_the_png(folder: Path, what: str) -> None:
+    """Chromium, shown the SVG, gives the picture of the PNG to within its smoothing of lines and its own letters."""
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("no chromium on this machine (Debian: apt-get install chromium)")
+    run(folder, str(folder / "out.png"), "--what", what)
+    run(folder, str(folder / "out.svg"), "--what", what)
+    expected = cv2.imread(str(folder / "out.png"))
+    size = f"--window-size={expected.shape[1]},{expected.shape[0] + 200}"
+    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", size]
+    where = [f"--screenshot={folder / 'shot.png'}", (folder / "out.svg").as_uri()]
+    subprocess.run([chromium, *flags, *where], check=True, timeout=60, capture_output=True)
+    drawn = cv2.imread(str(folder / "shot.png"))[: expected.shape[0], : expected.shape[1]]
+    assert np.abs(drawn.astype(int) - expected).mean() < 6
 
 
 def test_mistakes_are_sentences(folder: Path) -> None:
     (folder / "taken.png").write_bytes(b"mine")
     assert "--overwrite" in run(folder, str(folder / "taken.png"), code=2)
     assert ".png" in run(folder, str(folder / "out.gif"), code=3)
-    assert "SVG" in run(folder, str(folder / "out.svg"), "--what", "sheet", code=3)

@@ -28,8 +28,15 @@ def on_terminal(*arguments: object, keys_at: bytes | None = None, keys: bytes = 
     environment = os.environ | {"COLUMNS": "100", "TERM": "xterm", "UNBEND_RENDERER": "cpu"}
     command = [sys.executable, "-m", "unbend", "video", *map(str, arguments), "--workers", "1"]
     process = subprocess.Popen(
-        command, stdin=slave, stdout=slave, stderr=slave, env=environment, start_new_session=True,
-        preexec_fn=lambda: os.close(os.open(os.ttyname(slave), os.O_RDWR)),  # makes it the terminal that Ctrl-C comes from
+        command,
+        stdin=slave,
+        stdout=slave,
+        stderr=slave,
+        env=environment,
+        start_new_session=True,
+        preexec_fn=lambda: os.close(
+            os.open(os.ttyname(slave), os.O_RDWR)
+        ),  # makes it the terminal that Ctrl-C comes from
     )
     os.close(slave)
     seen, deadline = b"", time.monotonic() + 90
@@ -67,7 +74,10 @@ def test_the_bar_shows_frames_speed_and_the_time_left(film: Path, tmp_path: Path
     """How many of how many, frames a second that are not nothing, minutes and seconds; and one line at the end."""
     code, seen = on_terminal(film, tmp_path / "out.mp4", "--grid", grid_file, "--preset", "ultrafast")
     assert code == 0, seen
-    shown = [(int(done), float(fps), left) for done, fps, left in re.findall(r"(\d+)/300 frames .*? ([\d.]+) fps (\S+)", seen)]
+    shown = [
+        (int(done), float(fps), left)
+        for done, fps, left in re.findall(r"(\d+)/300 frames .*? ([\d.]+) fps (\S+)", seen)
+    ]
     done = [one[0] for one in shown]
     assert len(set(done)) > 3, seen
     assert done == sorted(done)
@@ -90,9 +100,7 @@ def test_a_bar_is_no_part_of_a_log(tmp_path: Path, grid_file: Path) -> None:
 def test_ctrl_c_on_the_keyboard_leaves_a_film_that_plays(film: Path, tmp_path: Path, grid_file: Path) -> None:
     """Some of the frames, all of them whole, the right size, and an exit code that says it was interrupted."""
     target = tmp_path / "out.mp4"
-    code, seen = on_terminal(
-        film, target, "--grid", grid_file, keys_at=rb"[1-9]\d+/300 frames", keys=b"\x03"
-    )
+    code, seen = on_terminal(film, target, "--grid", grid_file, keys_at=rb"[1-9]\d+/300 frames", keys=b"\x03")
     assert code == 130, seen
     assert "interrupted" in seen
     with av.open(str(target)) as container:

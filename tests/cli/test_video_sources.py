@@ -60,7 +60,7 @@ def test_a_running_server_draws_the_same_pictures(
 
 
 def test_a_server_estimates_and_leaves_alone(tmp_path: Path, server: Server) -> None:
-    """The estimate is the server's too, over frames of the whole file; below the asked confidence nothing is touched."""
+    """The estimate is the server's too; below the confidence that is asked for nothing is touched."""
     source = made(tmp_path / "in.mp4")
     estimates = server.metric("unbend_estimates_total")
     arguments = ("--server", server.grpc, "--min-confidence", 1, "--json")
@@ -155,8 +155,7 @@ def test_it_sits_between_two_ffmpegs(tmp_path: Path, grid_file: Path) -> None:
     source, target = made(tmp_path / "in.mp4"), tmp_path / "out.mp4"
     unbend = f"{shlex.quote(sys.executable)} -m unbend video - - --grid {shlex.quote(str(grid_file))} --workers 1"
     pipe = (
-        f"ffmpeg -v error -i {source} -f yuv4mpegpipe - | {unbend} | "
-        f"ffmpeg -v error -i - -c:v libx264 -crf 4 {target}"
+        f"ffmpeg -v error -i {source} -f yuv4mpegpipe - | {unbend} | ffmpeg -v error -i - -c:v libx264 -crf 4 {target}"
     )
     subprocess.run(["bash", "-eo", "pipefail", "-c", pipe], check=True, timeout=120)
     after = told(target)

@@ -1,25 +1,20 @@
-"""Illustrate: one picture in, the same picture out with what was estimated drawn over it."""
+"""Illustrate: one picture in, a figure of what was estimated of it out."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from enum import StrEnum
 
 from unbend_service.application.blocking import BlockingWork
-from unbend_service.application.correction import WRITTEN_FORMATS
+from unbend_service.application.correction import WRITTEN_FORMATS, Correction, CorrectOptions, leaves_alone
 from unbend_service.application.estimation import Estimation
-from unbend_service.application.ports import GridStore, Illustrator, ImageCodec
+from unbend_service.application.exhibit import Exhibit, Subject
+from unbend_service.application.ports import DecodedImage, GridStore, Illustrator, ImageCodec
 from unbend_service.domain.errors import InvalidOption
 from unbend_service.domain.frames import Frame
-from unbend_service.domain.records import Correct, GridRecord
+from unbend_service.domain.records import GridRecord
 
-
-class Subject(StrEnum):
-    """What is drawn over the picture."""
-
-    GUIDES = "guides"
-    GRID = "grid"
-    DISPLACEMENT = "displacement"
+SVG = "svg"
+FIGURE_FORMATS = (*WRITTEN_FORMATS, SVG)
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,11 +27,12 @@ class Illustrated:
 
 
 class Illustration:
-    """Decodes, estimates unless a grid is named, draws, encodes."""
+    """Decodes, estimates unless a grid is named, corrects where the figure shows it, draws, encodes."""
 
     def __init__(
         self,
         estimation: Estimation,
+        correction: Correction,
         codec: ImageCodec,
         store: GridStore,
         illustrator: Illustrator,
@@ -45,6 +41,7 @@ class Illustration:
         jpeg_quality: int,
     ) -> None:
         self._estimation = estimation
+        self._correction = correction
         self._codec = codec
         self._store = store
         self._illustrator = illustrator
@@ -52,39 +49,49 @@ class Illustration:
         self._jpeg_quality = jpeg_quality
 
     async def of_image(
-        self,
-        body: bytes,
-        subject: Subject,
-        correct: Correct = Correct.NONLINEAR,
-        *,
-        grid_id: str | None = None,
-        image_format: str | None = None,
+        self, body: bytes, subject: Subject, options: CorrectOptions, *, given: GridRecord | None = None
     ) -> Illustrated:
-        """Draws ``subject`` over the picture; the format stays unless another is named (png for one not written).
+        """Draws ``subject``; the format stays unless another is named (png for one not written).
+
+        Args:
+            options: of the estimate, and of the corrected picture in figures that show it; ``image_format`` may be
+                ``svg`` as well.
+            given: what is known already, instead of an estimate.
 
         Raises:
-            EmptyBody, UnsupportedMediaType, InvalidImage, TooManyPixels, GridNotFound, QueueFull.
+            EmptyBody, UnsupportedMediaType, InvalidImage, TooManyPixels, GridNotFound, QueueFull, FoldedGrid.
+            DeadlineExceeded, RendererUnavailable, PoisonFrame, Draining: of figures that show the corrected picture.
             InvalidOption: a format that is not written, or guides of a grid that has none.
         """
-        if image_format not in (None, *WRITTEN_FORMATS):
-            raise InvalidOption(f"format={image_format!r} is not written.", allowed=", ".join(WRITTEN_FORMATS))
+        if options.image_format not in (None, *FIGURE_FORMATS):
+            raise InvalidOption(f"format={options.image_format!r} is not written.", allowed=", ".join(FIGURE_FORMATS))
         image = await self._blocking.run("decode", self._codec.decode, body)
-        if grid_id is not None:
-            record = await self._store.get(grid_id)
-        else:
-            record = await self._estimation.of_image(body, correct)
-        drawn = await self._blocking.run("render", self._draw, image.frame, subject, record)
-        chosen = image_format or (image.image_format if image.image_format in WRITTEN_FORMATS else "png")
-        encoded = await self._blocking.run(
-            "encode", self._codec.encode, replace(image, frame=drawn), chosen, self._jpeg_quality
-        )
+        record = given or await self._record(body, options)
+        if subject is Subject.GUIDES and record.guides is None:
+            raise InvalidOption(f"The grid {record.id} has no guides.", allowed="grid or displacement")
+        exhibit = await self._exhibit(image.frame, subject, record, options)
+        chosen = options.image_format or (image.image_format if image.image_format in WRITTEN_FORMATS else "png")
+        if chosen == SVG:
+            return Illustrated(
+                await self._blocking.run("render", self._illustrator.vector, subject, exhibit), SVG, record
+            )
+        drawn = await self._blocking.run("render", self._illustrator.raster, subject, exhibit)
+        encoded = await self._encoded(image, drawn, chosen, options.quality)
         return Illustrated(encoded, chosen, record)
 
-    def _draw(self, frame: Frame, subject: Subject, record: GridRecord) -> Frame:
-        if subject is Subject.GRID:
-            return self._illustrator.grid(frame, record.grid)
-        if subject is Subject.DISPLACEMENT:
-            return self._illustrator.displacement(frame, record.grid)
-        if record.guides is None:
-            raise InvalidOption(f"The grid {record.id} has no guides.", allowed="what=grid, what=displacement")
-        return self._illustrator.guides(frame, record.guides)
+    async def _record(self, body: bytes, options: CorrectOptions) -> GridRecord:
+        if options.grid_id is not None:
+            return await self._store.get(options.grid_id)
+        return await self._estimation.of_image(body, options.correct, min_confidence=options.min_confidence)
+
+    async def _exhibit(self, frame: Frame, subject: Subject, record: GridRecord, options: CorrectOptions) -> Exhibit:
+        exhibit = Exhibit(frame, record.grid, record.guides)
+        if not subject.shows_result:
+            return exhibit
+        straight = await self._correction.render(frame, record, options)
+        drawn = record.grid if leaves_alone(record) else await self._correction.fitted(record, options)
+        return replace(exhibit, straight=straight, drawn=drawn)
+
+    async def _encoded(self, image: DecodedImage, drawn: Frame, chosen: str, quality: int | None) -> bytes:
+        wanted = self._jpeg_quality if quality is None else quality
+        return await self._blocking.run("encode", self._codec.encode, replace(image, frame=drawn), chosen, wanted)

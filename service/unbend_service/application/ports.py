@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from unbend_service.application.exhibit import Exhibit, Subject
 from unbend_service.domain.exchange import DenseMap, ExportedFile, ExportFormat, ImportFormat
 from unbend_service.domain.frames import Border, Frame
 from unbend_service.domain.grid import Grid
@@ -391,18 +392,17 @@ class GridFiles(Protocol):
 
 
 class Illustrator(Protocol):
-    """Draws what was estimated over the picture it was estimated from. Thread-safe; blocking."""
+    """Draws figures of what was estimated of a picture. Thread-safe; blocking.
 
-    def guides(self, frame: Frame, guides: Guides) -> Frame:
-        """``guides``, centred source coordinates, as curves over ``frame`` -> rgb24 of the same size."""
+    Both raise InvalidFrame for a planar frame, and InvalidOption for guides of a grid that has none.
+    """
+
+    def raster(self, subject: Subject, exhibit: Exhibit) -> Frame:
+        """The figure as rgb24: overlays have the size of the picture, others that of their panels."""
         ...
 
-    def grid(self, frame: Frame, grid: Grid) -> Frame:
-        """The lattice of ``grid`` (target -> source) over ``frame``, the source -> rgb24 of the same size."""
-        ...
-
-    def displacement(self, frame: Frame, grid: Grid) -> Frame:
-        """Arrows from source to target over ``frame``, with a legend in pixels -> rgb24 of the same size."""
+    def vector(self, subject: Subject, exhibit: Exhibit) -> bytes:
+        """The same figure as SVG, UTF-8."""
         ...
 
 

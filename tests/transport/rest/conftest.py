@@ -11,7 +11,7 @@ from PIL import Image
 
 from tests.fakes import FakeEstimator, FakeRenderPool
 from unbend_service.adapters.codecs.pillow import PillowCodec
-from unbend_service.adapters.drawing.overlay import OverlayIllustrator
+from unbend_service.adapters.drawing.figures import FigureIllustrator
 from unbend_service.adapters.exchange.files import ExchangeFiles
 from unbend_service.adapters.grid_stores.memory import MemoryGridStore
 from unbend_service.adapters.metrics.prometheus import PrometheusMeter
@@ -65,7 +65,7 @@ class Bench:
             jpeg_quality=settings.jpeg_quality,
             deadline_s=settings.render_deadline_s,
         )
-        illustration = Illustration(estimation, codec, store, OverlayIllustrator(), blocking, jpeg_quality=90)
+        illustration = Illustration(estimation, correction, codec, store, FigureIllustrator(), blocking, jpeg_quality=90)
         regions = Regions(self.pool, settings.local_memory_bytes)
         self.service = Service(
             estimation=estimation,

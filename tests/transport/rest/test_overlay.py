@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+from xml.etree import ElementTree
 
 import httpx
 import numpy as np
@@ -25,7 +26,7 @@ async def test_a_picture_of_the_estimate(client: httpx.AsyncClient, what: str, i
     assert response.headers["unbend-grid-id"]
 
 
-async def test_the_subject_is_chosen_from_three(client: httpx.AsyncClient, jpeg: bytes) -> None:
+async def test_the_subject_is_chosen_from_a_list(client: httpx.AsyncClient, jpeg: bytes) -> None:
     """Anything else is named."""
     response = await client.post("/v1/overlay?what=everything", content=jpeg)
     assert response.status_code == 422
@@ -38,3 +39,28 @@ async def test_a_stored_grid_can_be_drawn(client: httpx.AsyncClient, jpeg: bytes
     assert (await client.post(f"/v1/overlay?what=grid&grid_id={stored}", content=jpeg)).status_code == 200
     response = await client.post(f"/v1/overlay?what=guides&grid_id={stored}", content=jpeg)
     assert (response.status_code, response.json()["code"]) == (422, "invalid_option")
+
+
+@pytest.mark.parametrize("what", ["grids", "magnitude", "sheet"])
+async def test_figures_show_more_than_the_picture(client: httpx.AsyncClient, what: str) -> None:
+    """Panels and legends stand beside it, in the format that was asked for."""
+    response = await client.post(
+        f"/v1/overlay?what={what}&format=png&fit=keep", content=encoded(chequers(320, 240), "jpeg")
+    )
+    assert response.headers["content-type"] == "image/png"
+    width, height = Image.open(io.BytesIO(response.content)).size
+    assert width > 320
+    assert height >= 240
+
+
+@pytest.mark.parametrize("what", ["guides", "grid", "displacement", "grids", "magnitude", "sheet"])
+async def test_every_figure_comes_as_svg(client: httpx.AsyncClient, jpeg: bytes, what: str) -> None:
+    """One document with nothing outside of it, and nothing in it that runs."""
+    response = await client.post(f"/v1/overlay?what={what}&format=svg", content=jpeg)
+    assert response.headers["content-type"].startswith("image/svg+xml")
+    root = ElementTree.fromstring(response.content)
+    assert root.tag == "{http://www.w3.org/2000/svg}svg"
+    assert b"script" not in response.content
+    assert all(
+        element.get("href", "data:").startswith("data:image/png") for element in root.iter() if element.get("href")
+    )
