@@ -60,7 +60,7 @@ def _strokes(strokes: Strokes) -> Iterator[str]:
     if strokes.halo:
         everything = "".join(lines for lines, _ in families)
         width = halo_width_px(strokes.width_px)
-        yield f'<g {joints} stroke="#000" stroke-opacity="{HALO_OPACITY}" stroke-width="{width}">{everything}</g>'
+        yield f'<g {joints} stroke="#000" opacity="{HALO_OPACITY}" stroke-width="{width}">{everything}</g>'
     for lines, colour in families:
         yield f'<g {joints} stroke="{_hex(colour)}" stroke-width="{strokes.width_px:g}">{lines}</g>'
 
