@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import functools
-import http.server
 import json
+import re
 import shlex
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -78,21 +76,16 @@ def test_a_server_that_is_not_there_is_a_sentence(tmp_path: Path, grid_file: Pat
     assert not (tmp_path / "out.mp4").exists()
 
 
-class _Quiet(http.server.SimpleHTTPRequestHandler):
-    def log_message(self, *_: object) -> None:
-        pass
-
-
 @pytest.fixture
 def web(tmp_path: Path) -> Iterator[str]:
     """A web server over tmp_path that knows no ranges: what comes from it cannot be sought in."""
-    handler = functools.partial(_Quiet, directory=str(tmp_path))
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as running:
-        thread = threading.Thread(target=running.serve_forever)
-        thread.start()
-        yield f"http://127.0.0.1:{running.server_port}"
-        running.shutdown()
-        thread.join()
+    command = [sys.executable, "-u", "-m", "http.server", "0", "--bind", "127.0.0.1", "--directory", str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as running:
+        assert running.stdout is not None
+        port = re.search(r"port (\d+)", running.stdout.readline())
+        assert port is not None
+        yield f"http://127.0.0.1:{port[1]}"
+        running.terminate()
 
 
 def test_a_video_is_read_over_http(tmp_path: Path, grid_file: Path, web: str) -> None:
@@ -154,8 +147,11 @@ def test_it_sits_between_two_ffmpegs(tmp_path: Path, grid_file: Path) -> None:
     """ffmpeg | unbend video - - | ffmpeg: every frame, at its rate, in its colours."""
     source, target = made(tmp_path / "in.mp4"), tmp_path / "out.mp4"
     unbend = f"{shlex.quote(sys.executable)} -m unbend video - - --grid {shlex.quote(str(grid_file))} --workers 1"
+    # y4m does not say which matrix its colours have
+    said = "-colorspace bt709 -color_primaries bt709 -color_trc bt709"
     pipe = (
-        f"ffmpeg -v error -i {source} -f yuv4mpegpipe - | {unbend} | ffmpeg -v error -i - -c:v libx264 -crf 4 {target}"
+        f"ffmpeg -v error -i {source} -f yuv4mpegpipe - | {unbend} | "
+        f"ffmpeg -v error -i - -c:v libx264 -crf 4 {said} {target}"
     )
     subprocess.run(["bash", "-eo", "pipefail", "-c", pipe], check=True, timeout=120)
     after = told(target)

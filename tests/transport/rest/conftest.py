@@ -65,7 +65,9 @@ class Bench:
             jpeg_quality=settings.jpeg_quality,
             deadline_s=settings.render_deadline_s,
         )
-        illustration = Illustration(estimation, correction, codec, store, FigureIllustrator(), blocking, jpeg_quality=90)
+        illustration = Illustration(
+            estimation, correction, codec, store, FigureIllustrator(), blocking, jpeg_quality=90
+        )
         regions = Regions(self.pool, settings.local_memory_bytes)
         self.service = Service(
             estimation=estimation,

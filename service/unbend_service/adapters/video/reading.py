@@ -70,6 +70,7 @@ class PyavReader:
         #: The display matrix of the pictures; known once one of them is, None if they have none.
         self.display_matrix: tuple[int, ...] | None = None
         self._looked = False
+        self._next_dts: int | None = None
         #: Whether the packets of the video, as far as they were read, can be put into another container.
         self.can_copy = self.codec != "rawvideo"
         self._items = self._demuxed()
@@ -162,8 +163,10 @@ class PyavReader:
         for packet in self.container.demux([self.stream, *self.passengers]):
             is_video = packet.stream is self.stream
             passenger = Passenger(packet, is_video)
-            if is_video:
+            if is_video and packet.size:
                 self._examine(packet)
+                if self._copies_video or self._kept is not None:
+                    self._time(packet)
             if packet.dts is not None and self._kept is not None:
                 self._kept.append(passenger)
             if not is_video or self._copies_video:
@@ -183,9 +186,17 @@ class PyavReader:
                 yield [self._picture(picture) for picture in pictures]
 
     def _examine(self, packet: Any) -> None:
-        """Containers want to know when a packet is to be decoded and shown; cameras over RTP do not always say it."""
-        if packet.size and (packet.dts is None or packet.pts is None):
+        """Containers want to know when a packet is shown; cameras over RTP do not always say it."""
+        if packet.size and packet.pts is None:
             self.can_copy = False
+
+    def _time(self, packet: Any) -> None:
+        """Says when a packet is to be decoded where the container does not: Matroska leaves it out at the beginning."""
+        step = max(1, round(1 / (self.rate * self.stream.time_base)))
+        if packet.dts is None and packet.pts is not None:
+            first = packet.pts - step * int(self.stream.codec_context.reorder_depth)
+            packet.dts = first if self._next_dts is None else min(self._next_dts, packet.pts)
+        self._next_dts = None if packet.dts is None else packet.dts + step
 
     def _picture(self, picture: Any) -> Picture:
         if (picture.width, picture.height) != (self.width, self.height):

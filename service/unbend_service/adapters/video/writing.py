@@ -143,12 +143,12 @@ class PyavWriter:
             self.write_passenger(waiting)
 
     def _add_copy(self, passenger: Any) -> None:
-        name = passenger.codec_context.codec.name
-        codec_id = passenger.codec_context.name
-        if not {name, codec_id} & set(self._container.supported_codecs):
+        try:
+            copy = self._container.add_stream_from_template(passenger)
+        except ValueError:
+            codec_id = passenger.codec_context.name
             self.notes.append(f"{passenger.type} {codec_id} was left out: {self._target.suffix} does not hold it.")
             return
-        copy = self._container.add_stream_from_template(passenger)
         copy.metadata.update(passenger.metadata)
         copy.disposition = int(passenger.disposition)
         self._copies[passenger.index] = copy
