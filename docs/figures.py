@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from unbend_service.application.correction import CorrectOptions
-from unbend_service.application.illustration import Subject
+from unbend_service.application.exhibit import Subject
 from unbend_service.application.service import Service
 from unbend_service.cli.private import private_service
 from unbend_service.domain.fit import CROP, Fit
@@ -60,13 +60,13 @@ async def draw_figures(service: Service) -> None:
     scale = FIGURE_PX / image.shape[1]
     image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     body = cv2.imencode(".png", image)[1].tobytes()
-    for subject in Subject:
-        drawn = await service.illustration.of_image(body, subject)
+    for subject in (Subject.GUIDES, Subject.GRID, Subject.DISPLACEMENT):
+        drawn = await service.illustration.of_image(body, subject, CorrectOptions())
         _write(f"{subject.value}.jpg", drawn.body)
     # the same lattice once it is straight, in the frame in which it was estimated
     straight = await service.correction.of_image(body, CorrectOptions(fit=Fit.parse("keep")))
     regular = await service.grids.put_grid(Grid.identity())
-    drawn = await service.illustration.of_image(straight.body, Subject.GRID, grid_id=regular.id)
+    drawn = await service.illustration.of_image(straight.body, Subject.GRID, CorrectOptions(grid_id=regular.id))
     _write("grid-straight.jpg", drawn.body)
 
 

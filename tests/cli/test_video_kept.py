@@ -92,7 +92,8 @@ def test_a_video_that_is_left_alone_is_copied(tmp_path: Path, suffix: str) -> No
     moved = after["times"][0] - before["times"][0]
     np.testing.assert_allclose(np.array(after["times"]) - moved, before["times"], atol=2e-3)
     assert after["sound"][0][0] - before["sound"][0][0] == pytest.approx(moved, abs=2e-3)
-    assert [data for _, data in after["sound"]] == [data for _, data in before["sound"]]
+    header = 7 if suffix == ".ts" else 0  # each frame of sound has its ADTS header there
+    assert [data[header:] for _, data in after["sound"]] == [data for _, data in before["sound"]]
     if suffix != ".ts":  # which holds no orientation, and repeats the encoder's parameters in its packets
         assert after["rotation"] == before["rotation"]
         assert [data for _, data in packets(target, "video")] == [data for _, data in packets(source, "video")]

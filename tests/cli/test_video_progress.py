@@ -1,4 +1,4 @@
-"""What a person sees of ``unbend video`` while it runs, on a real terminal, and what Ctrl-C leaves."""
+"""What a person sees of ``unbend video`` while it runs, on a real terminal."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.videos import WIDTH, av, made
+from tests.cli.videos import made
 
 _ESCAPES = re.compile(rb"\x1b\[[0-9;?]*[A-Za-z]")
 
 
-def on_terminal(*arguments: object, keys_at: bytes | None = None, keys: bytes = b"") -> tuple[int, str]:
-    """Runs the command on a terminal of its own; types ``keys`` once ``keys_at`` is shown.
+def on_terminal(*arguments: object) -> tuple[int, str]:
+    """Runs the command on a terminal of its own.
 
     Returns:
         Exit code, and what was shown without its escape sequences.
@@ -50,9 +50,6 @@ def on_terminal(*arguments: object, keys_at: bytes | None = None, keys: bytes = 
             if not part:
                 break
             seen += part
-            if keys and keys_at is not None and re.search(keys_at, _ESCAPES.sub(b"", seen)):
-                os.write(master, keys)
-                keys = b""
         elif process.poll() is not None:
             break
     os.close(master)
@@ -95,15 +92,3 @@ def test_a_bar_is_no_part_of_a_log(tmp_path: Path, grid_file: Path) -> None:
     code, seen = on_terminal(source, tmp_path / "two.mp4", "--grid", grid_file, "--quiet")
     assert code == 0
     assert "fps" not in seen
-
-
-def test_ctrl_c_on_the_keyboard_leaves_a_film_that_plays(film: Path, tmp_path: Path, grid_file: Path) -> None:
-    """Some of the frames, all of them whole, the right size, and an exit code that says it was interrupted."""
-    target = tmp_path / "out.mp4"
-    code, seen = on_terminal(film, target, "--grid", grid_file, keys_at=rb"[1-9]\d+/300 frames", keys=b"\x03")
-    assert code == 130, seen
-    assert "interrupted" in seen
-    with av.open(str(target)) as container:
-        frames = list(container.decode(video=0))
-    assert 10 <= len(frames) < 300
-    assert frames[0].width == 1280 != WIDTH
