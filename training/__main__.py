@@ -12,6 +12,8 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from training.vgg_commands import add_verbs as add_vgg_verbs
+
 if TYPE_CHECKING:
     from training.loop import Recipe
 
@@ -93,6 +95,7 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--limit", type=int, default=48, help="photographs per family")
     evaluate.add_argument("--threshold", type=float, default=0.5, help="confidence below which nothing is corrected")
     evaluate.set_defaults(verb=_evaluate)
+    add_vgg_verbs(verbs)
     return parser
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from unbend_service.adapters.estimators.cards import SETTING, ModelCard, read_card
+from unbend_service.adapters.estimators.coefficients import CoefficientsEstimator
 from unbend_service.adapters.estimators.first import FirstEstimator
 from unbend_service.adapters.estimators.lineset import LinesetEstimator
 from unbend_service.application.ports import Estimator
@@ -12,6 +13,7 @@ from unbend_service.domain.errors import ModelUnavailable
 
 #: ``kind`` of a card -> what makes an estimator of (card, threads).
 KINDS: dict[str, Callable[[ModelCard, int], Estimator]] = {
+    "coefficients": CoefficientsEstimator,
     "lineset": LinesetEstimator,
     "picture": FirstEstimator,
 }
