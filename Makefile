@@ -17,7 +17,7 @@ $(VENV)/.service: pyproject.toml $(CONSTRAINTS) | $(BIN)/python
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml $(CONSTRAINTS) | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS) -e '.[service,redis,video,export,lensfun]' --group dev
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS) -e '.[service,redis,video,export,lensfun,otel]' --group dev
 	@touch $@ $(VENV)/.service
 
 $(VENV)/.e2e: pyproject.toml $(CONSTRAINTS) $(VENV)/.dev
@@ -64,6 +64,11 @@ verify-dashboard: setup-dev  ## Run every query of the dashboard against the rea
 	$(BIN)/python -m deploy.checks.dashboard
 
 .PHONY: check-deploy verify-dashboard
+
+scan: setup-dev  ## Try every route and RPC without a token, with a wrong one, and with one of the wrong scope
+	$(BIN)/python -m tests.access.scan
+
+.PHONY: scan
 
 PHOTOS ?= ../shared/photos
 

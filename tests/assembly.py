@@ -19,11 +19,13 @@ from unbend_service.application.regions import Regions
 from unbend_service.application.service import Service
 from unbend_service.application.streams import Streams
 from unbend_service.settings import Settings
+from unbend_service.wiring import build_access
 
 
 def service_over_fakes(settings: Settings, store: MemoryGridStore | None = None) -> Service:
     """Real use cases, codec and grid store over fakes of the estimator and the pool."""
     meter, estimator, pool = RecordingMeter(), FakeEstimator(), FakeRenderPool()
+    access = build_access(settings, meter)
     blocking = BlockingWork(2, settings.queue_frames, meter)
     codec, store = PillowCodec(settings), store or MemoryGridStore(settings)
     grids = FittedGrids(blocking, meter)
@@ -58,4 +60,5 @@ def service_over_fakes(settings: Settings, store: MemoryGridStore | None = None)
         blocking=blocking,
         estimator=estimator,
         bodies=MemoryBudget(settings.bodies_bytes, "bodies_bytes"),
+        access=access,
     )

@@ -41,9 +41,11 @@ if TYPE_CHECKING:
     from unbend._errors import ModelUnavailable as ModelUnavailable
     from unbend._errors import NotServedHere as NotServedHere
     from unbend._errors import Overloaded as Overloaded
+    from unbend._errors import PermissionDenied as PermissionDenied
     from unbend._errors import PoisonFrame as PoisonFrame
     from unbend._errors import ProtocolViolation as ProtocolViolation
     from unbend._errors import QueueFull as QueueFull
+    from unbend._errors import RateLimited as RateLimited
     from unbend._errors import Refused as Refused
     from unbend._errors import RegionNotFound as RegionNotFound
     from unbend._errors import RendererUnavailable as RendererUnavailable
@@ -56,6 +58,7 @@ if TYPE_CHECKING:
     from unbend._errors import TooManyPixels as TooManyPixels
     from unbend._errors import TooManyRegions as TooManyRegions
     from unbend._errors import TooManyStreams as TooManyStreams
+    from unbend._errors import Unauthenticated as Unauthenticated
     from unbend._errors import Unavailable as Unavailable
     from unbend._errors import UnbendError as UnbendError
     from unbend._errors import Unreachable as Unreachable
@@ -103,9 +106,11 @@ _HOMES = {
         "ModelUnavailable",
         "NotServedHere",
         "Overloaded",
+        "PermissionDenied",
         "PoisonFrame",
         "ProtocolViolation",
         "QueueFull",
+        "RateLimited",
         "Refused",
         "RegionNotFound",
         "RenderFailed",
@@ -118,6 +123,7 @@ _HOMES = {
         "TooManyPixels",
         "TooManyRegions",
         "TooManyStreams",
+        "Unauthenticated",
         "Unavailable",
         "UnbendError",
         "Unreachable",

@@ -13,7 +13,7 @@ import grpc
 from unbend import _calls as calls
 from unbend import _types as types
 from unbend._async_stream import AsyncStream
-from unbend._channel import open_channel
+from unbend._channel import PathLike, open_channel, to_credentials, to_metadata
 from unbend._client import DEFAULT_TARGET
 from unbend._errors import Closed
 from unbend._failures import translate
@@ -41,14 +41,19 @@ class AsyncClient:
         *,
         timeout_s: float = 30.0,
         retries: int = 2,
+        token: str | None = None,
+        tls: bool = False,
+        ca_file: PathLike | None = None,
+        cert_file: PathLike | None = None,
+        key_file: PathLike | None = None,
         credentials: grpc.ChannelCredentials | None = None,
         metadata: Sequence[tuple[str, str]] = (),
         shared_memory: str | os.PathLike[str] | None = None,
     ) -> None:
-        self._channel = open_channel(target, credentials)
+        self._metadata = to_metadata(token, metadata)
+        self._channel = open_channel(target, to_credentials(credentials, tls, ca_file, cert_file, key_file))
         self._timeout_s = timeout_s
         self._retries = retries
-        self._metadata = tuple(metadata)
         self._shared_memory = None if shared_memory is None else os.fspath(shared_memory)
         self._closed = False
         self.grids = AsyncGrids(self)

@@ -12,7 +12,7 @@ import grpc
 
 from unbend import _calls as calls
 from unbend import _types as types
-from unbend._channel import open_channel
+from unbend._channel import PathLike, open_channel, to_credentials, to_metadata
 from unbend._errors import Closed
 from unbend._failures import translate
 from unbend._images import FrameLayout
@@ -38,10 +38,17 @@ class Client:
         target: host:port of the service.
         timeout_s: seconds that a call may take, its retries included, and that one answer of a stream may take.
         retries: attempts after the first, of calls that may be repeated, when the server is gone or at a limit.
-        credentials: of ``grpc.ssl_channel_credentials`` for TLS; None connects in the clear.
-        metadata: pairs that are sent with every call, ``("authorization", "Bearer ...")`` for one.
+        token: sent with every call; that of the environment variable UNBEND_TOKEN if left out.
+        tls: connect with TLS; the files below say so too.
+        ca_file: PEM authorities of the server; those of the system if left out.
+        cert_file, key_file: PEM certificate of this client and its key, for a server that asks for one.
+        credentials: of ``grpc.ssl_channel_credentials``, instead of the files.
+        metadata: pairs that are sent with every call.
         shared_memory: the local socket of a service on this host (its setting ``local_socket``): the raw frames of
             streams then pass through shared memory instead of the connection. Linux only.
+
+    Raises:
+        InvalidOption: a file cannot be read, or a token cannot be sent.
     """
 
     def __init__(
@@ -50,14 +57,19 @@ class Client:
         *,
         timeout_s: float = 30.0,
         retries: int = 2,
+        token: str | None = None,
+        tls: bool = False,
+        ca_file: PathLike | None = None,
+        cert_file: PathLike | None = None,
+        key_file: PathLike | None = None,
         credentials: grpc.ChannelCredentials | None = None,
         metadata: Sequence[tuple[str, str]] = (),
         shared_memory: str | os.PathLike[str] | None = None,
     ) -> None:
-        self._channel = open_channel(target, credentials)
+        self._metadata = to_metadata(token, metadata)
+        self._channel = open_channel(target, to_credentials(credentials, tls, ca_file, cert_file, key_file))
         self._timeout_s = timeout_s
         self._retries = retries
-        self._metadata = tuple(metadata)
         self._shared_memory = None if shared_memory is None else os.fspath(shared_memory)
         self._closed = False
         self.grids = Grids(self)

@@ -26,6 +26,7 @@ The tree; what stands in brackets is the builtin that the error also is::
     │   ├── QueueFull
     │   ├── MemoryFull
     │   ├── TooManyRegions
+    │   ├── RateLimited
     │   └── TooManyStreams
     ├── Unavailable [ConnectionError]
     │   ├── Draining
@@ -41,7 +42,9 @@ The tree; what stands in brackets is the builtin that the error also is::
     │   └── StreamIdle
     ├── RequestStalled [TimeoutError]
     ├── DeadlineExceeded [TimeoutError]
-    ├── Refused [PermissionError]  the server wants credentials, or others
+    ├── Refused [PermissionError]
+    │   ├── Unauthenticated        the server wants a token, or another
+    │   └── PermissionDenied       the token is not for this
     ├── ServerFault                the server failed, or does not speak unbend.v1
     ├── Closed                     the client or stream was closed before
     └── MissingPackage [ImportError]  an optional package is not installed here
@@ -229,6 +232,12 @@ class TooManyRegions(Overloaded):
     code = "too_many_regions"
 
 
+class RateLimited(Overloaded):
+    """More calls than this token may make."""
+
+    code = "rate_limited"
+
+
 class TooManyStreams(Overloaded):
     """More streams are open than are allowed."""
 
@@ -323,6 +332,18 @@ class Refused(UnbendError, PermissionError):
     """The server wants credentials, or others."""
 
     code = "refused"
+
+
+class Unauthenticated(Refused):
+    """The server wants a token, or another one than was sent."""
+
+    code = "unauthenticated"
+
+
+class PermissionDenied(Refused):
+    """The token is known to the server, but not for this."""
+
+    code = "permission_denied"
 
 
 class ServerFault(UnbendError):

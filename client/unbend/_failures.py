@@ -17,7 +17,7 @@ BY_STATUS: dict[grpc.StatusCode, type[errors.UnbendError]] = {
     grpc.StatusCode.DEADLINE_EXCEEDED: errors.DeadlineExceeded,
     grpc.StatusCode.NOT_FOUND: errors.ServerFault,
     grpc.StatusCode.ALREADY_EXISTS: errors.ServerFault,
-    grpc.StatusCode.PERMISSION_DENIED: errors.Refused,
+    grpc.StatusCode.PERMISSION_DENIED: errors.PermissionDenied,
     grpc.StatusCode.RESOURCE_EXHAUSTED: errors.BodyTooLarge,  # of the transport itself: the message bound
     grpc.StatusCode.FAILED_PRECONDITION: errors.ServerFault,
     grpc.StatusCode.ABORTED: errors.ServerFault,
@@ -26,7 +26,7 @@ BY_STATUS: dict[grpc.StatusCode, type[errors.UnbendError]] = {
     grpc.StatusCode.INTERNAL: errors.ServerFault,
     grpc.StatusCode.UNAVAILABLE: errors.Unreachable,
     grpc.StatusCode.DATA_LOSS: errors.ServerFault,
-    grpc.StatusCode.UNAUTHENTICATED: errors.Refused,
+    grpc.StatusCode.UNAUTHENTICATED: errors.Unauthenticated,
 }
 
 #: What proxies make of a server that vanished in the middle of a call. The service itself answers with a request id.

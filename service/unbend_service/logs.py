@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import logging
 import sys
+from typing import Any
 
 import structlog
 
+from unbend_service.domain.access import PREFIX, TOKEN
 from unbend_service.settings import Settings
+
+
+def strike_tokens(logger: object, name: str, line: Any) -> str:
+    """The rendered line without tokens: callers put them into paths, ids and texts of errors."""
+    return TOKEN.sub(f"{PREFIX}***", str(line))
 
 
 def configure_logs(settings: Settings) -> None:
@@ -33,7 +40,7 @@ def configure_logs(settings: Settings) -> None:
     handler.setFormatter(
         structlog.stdlib.ProcessorFormatter(
             foreign_pre_chain=shared,
-            processors=[structlog.stdlib.ProcessorFormatter.remove_processors_meta, *renderer],
+            processors=[structlog.stdlib.ProcessorFormatter.remove_processors_meta, *renderer, strike_tokens],
         )
     )
     root = logging.getLogger()

@@ -6,23 +6,28 @@ import asyncio
 import os
 import signal
 import socket
+import ssl
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import grpc
 import structlog
 import uvicorn
+from fastapi import FastAPI
 
 from unbend_service.allocator import share_arenas
 from unbend_service.application.service import Service
+from unbend_service.exposure import check_exposure
+from unbend_service.refreshing import refreshed
 from unbend_service.settings import Settings
 from unbend_service.transport.local.listener import MemoryListener
-from unbend_service.transport.rest.app import create_app
+from unbend_service.transport.rest.app import create_app, create_ops_app
 from unbend_service.transport.rest.connections import guarded_protocol
 from unbend_service.transport.rpc.server import start_server
+from unbend_service.transport.tls import Certificates, read_certificates
 from unbend_service.wiring import build_service
 
 log = structlog.get_logger(__name__)
@@ -33,10 +38,15 @@ _LAST_BYTES_S, _LAST_WORDS_S = 1, 8.0
 
 @dataclass(frozen=True, slots=True)
 class Addresses:
-    """Where the service listens: host:port of each transport, with the ports that were really taken."""
+    """Where the service listens: host:port of each transport, with the ports that were really taken.
+
+    Attributes:
+        ops: of health and metrics, if they have a listener of their own.
+    """
 
     http: str
     grpc: str
+    ops: str | None = None
 
 
 class _HttpServer(uvicorn.Server):
@@ -60,31 +70,45 @@ async def serve(settings: Settings, on_ready: Callable[[Addresses], None] | None
     share_arenas()
     stop: asyncio.Future[signal.Signals] = asyncio.get_running_loop().create_future()
     _handle_signals(stop)
-    http_socket = _bound_socket(settings.http_host, settings.http_port)
+    for warning in check_exposure(settings):
+        log.warning("exposed", message=warning)
+    certificates = read_certificates(settings)
+    with ExitStack() as held:
+        http_socket = held.enter_context(_bound_socket(settings.http_host, settings.http_port))
+        ops_socket = None
+        if settings.ops_port is not None:
+            ops_socket = held.enter_context(_bound_socket(settings.ops_host, settings.ops_port))
+        await _serve(settings, stop, certificates, http_socket, ops_socket, on_ready)
+
+
+async def _serve(
+    settings: Settings,
+    stop: asyncio.Future[signal.Signals],
+    certificates: Certificates | None,
+    http_socket: socket.socket,
+    ops_socket: socket.socket | None,
+    on_ready: Callable[[Addresses], None] | None,
+) -> None:
     service = build_service(settings)
     listener: MemoryListener | None = None
     try:
         await service.start()
-        rpc_server, rpc_port = await start_server(service, settings)
+        rpc_server, rpc_port = await start_server(service, settings, certificates)
         if settings.local_socket is not None:
             listener = MemoryListener(settings.local_socket, service.regions, settings.streams)
             listener.start()
-        http_server = _HttpServer(
-            uvicorn.Config(
-                create_app(service, settings),
-                http=guarded_protocol(settings),
-                ws="none",
-                lifespan="off",
-                access_log=False,
-                log_config=None,
-                server_header=False,
-                timeout_graceful_shutdown=_LAST_BYTES_S,
-            )
-        )
+        app = create_app(service, settings)
+        http_server = _http_server(app, settings, certificates.http() if certificates else None)
         serving = asyncio.create_task(http_server.serve(sockets=[http_socket]))
+        ops_server = None
+        if ops_socket is not None:
+            ops_app = create_ops_app(service)
+            ops_server = _http_server(ops_app, settings, certificates.ops() if certificates else None)
+            ops_serving = asyncio.create_task(ops_server.serve(sockets=[ops_socket]))
         addresses = Addresses(
             f"{settings.http_host}:{http_socket.getsockname()[1]}",
             f"{settings.grpc_host}:{rpc_port}",
+            f"{settings.ops_host}:{ops_socket.getsockname()[1]}" if ops_socket is not None else None,
         )
         pool = service.pool.state()
         renderer = pool.renderer
@@ -92,6 +116,9 @@ async def serve(settings: Settings, on_ready: Callable[[Addresses], None] | None
             "ready",
             http=addresses.http,
             grpc=addresses.grpc,
+            ops=addresses.ops,
+            tls=certificates is not None,
+            tokens=service.access.required,
             local_socket=None if settings.local_socket is None else str(settings.local_socket),
             renderer=renderer.name if renderer else None,
             device=renderer.device if renderer else None,
@@ -103,15 +130,34 @@ async def serve(settings: Settings, on_ready: Callable[[Addresses], None] | None
         if on_ready is not None:
             on_ready(addresses)
         ends: set[asyncio.Future[Any]] = {serving, stop}
-        await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
-        notice_s = settings.drain_notice_s if stop.done() and stop.result() == signal.SIGTERM else 0.0
-        _end_at_last(notice_s + settings.drain_s + _LAST_WORDS_S)
-        await _drain(service, settings, notice_s, http_server, serving, rpc_server)
+        with refreshed(service.access, certificates):
+            await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
+            notice_s = settings.drain_notice_s if stop.done() and stop.result() == signal.SIGTERM else 0.0
+            _end_at_last(notice_s + settings.drain_s + _LAST_WORDS_S)
+            await _drain(service, settings, notice_s, http_server, serving, rpc_server)
+        if ops_server is not None:  # probes were answered to the end
+            ops_server.should_exit = True
+            await ops_serving
     finally:
-        http_socket.close()
         if listener is not None:
             listener.close()
         await service.close(0.0)
+
+
+def _http_server(app: FastAPI, settings: Settings, context: ssl.SSLContext | None) -> uvicorn.Server:
+    return _HttpServer(
+        uvicorn.Config(
+            app,
+            http=guarded_protocol(settings),
+            ws="none",
+            lifespan="off",
+            access_log=False,
+            log_config=None,
+            server_header=False,
+            timeout_graceful_shutdown=_LAST_BYTES_S,
+            ssl_context_factory=None if context is None else lambda config, default: context,
+        )
+    )
 
 
 async def _drain(

@@ -21,11 +21,53 @@ class Settings(BaseSettings):
         None, description="With the role render: gRPC address of the estimation nodes, host:port or dns:///host:port."
     )
     estimator_timeout_s: float = Field(10.0, gt=0, description="Longest wait for an estimation node.")
+    estimator_token_file: Path | None = Field(
+        None, description="File that holds the token for that node, of the scope correct."
+    )
+    estimator_ca: Path | None = Field(
+        None,
+        description="PEM authorities of that node; set: asked over TLS, with the own certificate if there is one.",
+    )
 
     http_host: str = Field("127.0.0.1", description="Address that HTTP listens on.")
     http_port: int = Field(8080, ge=0, le=65535, description="Port of HTTP; 0 takes a free one.")
     grpc_host: str = Field("127.0.0.1", description="Address that gRPC listens on.")
     grpc_port: int = Field(50051, ge=0, le=65535, description="Port of gRPC; 0 takes a free one.")
+
+    ops_host: str = Field("127.0.0.1", description="Address of the listener for health and metrics.")
+    ops_port: int | None = Field(
+        None,
+        ge=0,
+        le=65535,
+        description="Port of a listener for /livez, /readyz and /metrics alone, which HTTP then has no longer; "
+        "0 takes a free one; unset: HTTP has them.",
+    )
+
+    tokens_file: Path | None = Field(
+        None, description="File of the tokens that are accepted, read again when it changes; unset: anybody may call."
+    )
+    token_rate_per_s: float | None = Field(
+        None, gt=0, description="Pictures and frames a second of one token, unless its line says; unset: no bound."
+    )
+    token_burst: int = Field(
+        20, ge=1, description="Pictures and frames at once of a token with a rate, unless its line says."
+    )
+    token_streams: int = Field(64, ge=1, description="Streams of one token at once, unless its line says.")
+    open_access: bool = Field(
+        False, description="Listen on every address of the machine even though nobody has to show who he is."
+    )
+    cors_origins: str = Field(
+        "", description="Origins whose pages may call the API, `https://a.example,https://b.example`; empty: none."
+    )
+
+    tls_cert: Path | None = Field(
+        None, description="PEM chain of both transports, read again when it changes; unset: plain text."
+    )
+    tls_key: Path | None = Field(None, description="PEM key of the certificate.")
+    tls_client_ca: Path | None = Field(
+        None, description="PEM authorities; set: only clients with a certificate of theirs may connect."
+    )
+    tls_required: bool = Field(False, description="Do not start without a certificate.")
 
     renderer: Literal["auto", "egl", "cpu"] = Field("auto", description="auto: EGL on a hardware GPU, else cpu.")
     require_gpu: bool = Field(False, description="Not ready on a software renderer.")
@@ -154,6 +196,13 @@ class Settings(BaseSettings):
     drain_s: float = Field(20.0, ge=0, description="Grace for accepted work after SIGTERM.")
     log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="Least severe log line.")
     log_format: Literal["console", "json"] = Field("console", description="How log lines look.")
+    otlp_endpoint: str | None = Field(
+        None,
+        description="Collector of OpenTelemetry traces (OTLP over gRPC), `http://host:4317`; needs [otel].",
+    )
+    trace_share: float = Field(
+        1.0, ge=0, le=1, description="Share of the traces that begin here which are kept; callers decide on theirs."
+    )
 
 
 def settings_table() -> str:

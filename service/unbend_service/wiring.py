@@ -11,6 +11,7 @@ from unbend_service.adapters.decoding.files import IsolatedFiles
 from unbend_service.adapters.decoding.pool import DecoderPool
 from unbend_service.adapters.drawing.figures import FigureIllustrator
 from unbend_service.adapters.estimators.catalogue import load_estimator
+from unbend_service.adapters.estimators.node_credentials import read_node_credentials
 from unbend_service.adapters.estimators.remote import RemoteEstimator
 from unbend_service.adapters.exchange.files import ExchangeFiles
 from unbend_service.adapters.grid_stores.memory import MemoryGridStore
@@ -20,6 +21,8 @@ from unbend_service.adapters.grid_stores.sqlite import SqliteGridStore
 from unbend_service.adapters.metrics.prometheus import PrometheusMeter
 from unbend_service.adapters.renderers.absent import AbsentPool
 from unbend_service.adapters.renderers.pool import WorkerPool
+from unbend_service.adapters.tokens.file import TokenFile
+from unbend_service.application.access import Access
 from unbend_service.application.admission import Admission
 from unbend_service.application.blocking import BlockingWork
 from unbend_service.application.budget import MemoryBudget
@@ -29,10 +32,11 @@ from unbend_service.application.exchange import Exchange
 from unbend_service.application.fitting import FittedGrids
 from unbend_service.application.grids import GridLibrary
 from unbend_service.application.illustration import Illustration
-from unbend_service.application.ports import Estimator, GridStore, Meter, RenderPool
+from unbend_service.application.ports import Estimator, GridStore, Meter, RenderPool, Tracer
 from unbend_service.application.regions import Regions
 from unbend_service.application.service import Service
 from unbend_service.application.streams import Streams
+from unbend_service.application.tracing import NoTracer
 from unbend_service.domain.errors import InvalidOption
 from unbend_service.settings import Settings
 
@@ -74,7 +78,40 @@ def build_remote_estimator(settings: Settings) -> RemoteEstimator:
             allowed="host:port of a node with the role all or estimate",
             setting="estimator_address",
         )
-    return RemoteEstimator(settings.estimator_address, settings.estimator_timeout_s)
+    credentials = read_node_credentials(settings)
+    return RemoteEstimator(
+        settings.estimator_address,
+        settings.estimator_timeout_s,
+        credentials=credentials.channel,
+        metadata=credentials.metadata,
+    )
+
+
+def build_meter(settings: Settings) -> tuple[Meter, Tracer]:
+    """What counts, and what makes spans. Raises InvalidOption: traces are wanted and the extra is not installed."""
+    if settings.otlp_endpoint is None:
+        return PrometheusMeter(), NoTracer()
+    try:
+        from unbend_service.adapters.tracing.opentelemetry import OpenTelemetryTracer, TracingMeter
+    except ImportError as error:
+        raise InvalidOption(
+            f"Traces need the extra otel ({error.name} is missing).",
+            allowed="pip install 'unbend[otel]'",
+            setting="otlp_endpoint",
+        ) from error
+    tracer = OpenTelemetryTracer(settings.otlp_endpoint, settings.trace_share)
+    return TracingMeter(tracer), tracer
+
+
+def build_access(settings: Settings, meter: Meter) -> Access:
+    """Who is let in. Raises InvalidOption: the tokens cannot be read."""
+    return Access(
+        TokenFile(settings.tokens_file) if settings.tokens_file is not None else None,
+        meter,
+        rate_per_s=settings.token_rate_per_s,
+        burst=settings.token_burst,
+        streams=settings.token_streams,
+    )
 
 
 def build_exchange() -> Exchange:
@@ -84,13 +121,15 @@ def build_exchange() -> Exchange:
     return Exchange(ExchangeFiles(), FittedGrids(blocking, meter), blocking)
 
 
-def build_service(settings: Settings, meter: PrometheusMeter | None = None) -> Service:
+def build_service(settings: Settings) -> Service:
     """The whole application, not yet started.
 
     Raises:
-        InvalidOption: the model is not known or its file is broken.
+        InvalidOption: the model is not known or its file is broken; the tokens cannot be read;
+            traces are wanted and the extra is not installed.
     """
-    meter = meter or PrometheusMeter()
+    meter, tracer = build_meter(settings)
+    access = build_access(settings, meter)
     blocking = BlockingWork(usable_cores(), settings.queue_frames, meter)
     decoders = DecoderPool(settings, meter)
     codec = IsolatedCodec(decoders, PillowCodec(settings))
@@ -152,7 +191,9 @@ def build_service(settings: Settings, meter: PrometheusMeter | None = None) -> S
         blocking,
         estimator,
         MemoryBudget(settings.bodies_bytes, "bodies_bytes"),
+        access,
         admission=Admission(settings.queue_frames - settings.queue_frames // 2),
         role=settings.role,
+        tracer=tracer,
         closing=closing,
     )

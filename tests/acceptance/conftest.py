@@ -20,7 +20,7 @@ class Server:
     """A real ``unbend serve`` on free ports.
 
     Attributes:
-        http, grpc: host:port.
+        http, grpc: host:port; ops, of health and metrics, if they are apart.
         lines: what it has logged so far, parsed.
     """
 
@@ -28,6 +28,7 @@ class Server:
     lines: list[dict[str, object]] = field(default_factory=list)
     http: str = ""
     grpc: str = ""
+    ops: str = ""
 
     def metric(self, name: str, **labels: str) -> float:
         """Sum of the samples of one metric whose labels contain ``labels``."""
@@ -68,7 +69,7 @@ def start_server(*, before: tuple[str, ...] = (), **settings: str) -> Server:
             entry = json.loads(line) if line.startswith("{") else {"event": line}
             server.lines.append(entry)
             if entry["event"] == "ready":
-                server.http, server.grpc = str(entry["http"]), str(entry["grpc"])
+                server.http, server.grpc, server.ops = str(entry["http"]), str(entry["grpc"]), str(entry["ops"] or "")
                 ready.set()
 
     reader = threading.Thread(target=read, daemon=True)

@@ -6,7 +6,8 @@ import asyncio
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import ParamSpec, TypeVar
+from contextvars import copy_context
+from typing import Any, ParamSpec, TypeVar
 
 from unbend_service.application.ports import Meter
 from unbend_service.domain.errors import QueueFull
@@ -36,14 +37,16 @@ class BlockingWork:
                 "Too many images wait to be decoded or estimated.", setting="queue_frames", retry_after_s=1.0
             )
         self._pending += 1
-        work = asyncio.get_running_loop().run_in_executor(self._executor, self._timed, stage, function, args, kwargs)
+        context = copy_context()  # so that the duration counts as the caller's
+        loop = asyncio.get_running_loop()
+        work = loop.run_in_executor(self._executor, context.run, self._timed, stage, function, args, kwargs)
         work.add_done_callback(self._finished)
         return await work
 
     def _finished(self, _: asyncio.Future[R]) -> None:
         self._pending -= 1
 
-    def _timed(self, stage: str, function: Callable[..., R], args: tuple[object, ...], kwargs: dict[str, object]) -> R:
+    def _timed(self, stage: str, function: Callable[..., R], args: tuple[Any, ...], kwargs: dict[str, Any]) -> R:
         start = time.perf_counter()
         try:
             return function(*args, **kwargs)

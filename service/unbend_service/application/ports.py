@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -9,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from unbend_service.application.exhibit import Exhibit, Subject
+from unbend_service.domain.access import Grant
 from unbend_service.domain.exchange import DenseMap, ExportedFile, ExportFormat, ImportFormat
 from unbend_service.domain.frames import Border, Frame
 from unbend_service.domain.grid import Grid
@@ -406,6 +409,18 @@ class Illustrator(Protocol):
         ...
 
 
+class TokenSource(Protocol):
+    """The tokens that are accepted. Blocking."""
+
+    def read(self) -> Sequence[Grant] | None:
+        """All of them if they changed since the last call, else None.
+
+        Raises:
+            InvalidOption: they cannot be read; raised once for each change.
+        """
+        ...
+
+
 class Meter(Protocol):
     """Counts what happens. Never blocks, never raises."""
 
@@ -447,4 +462,32 @@ class Meter(Protocol):
 
     def render(self) -> tuple[bytes, str]:
         """Everything counted so far as text for a scraper, and its content type."""
+        ...
+
+
+class RequestTrace(Protocol):
+    """One request in its trace.
+
+    Attributes:
+        trace_id: 32 hexadecimal digits; empty where there is none.
+    """
+
+    trace_id: str
+
+    def answered(self, name: str, code: str, failed: bool) -> None:
+        """Says what the request was, and how it ended; ``failed``: through a fault of the service."""
+        ...
+
+
+class Tracer(Protocol):
+    """Makes spans of requests. Never blocks, never raises."""
+
+    def request(
+        self, transport: str, name: str, request_id: str, traceparent: str | None
+    ) -> AbstractContextManager[RequestTrace]:
+        """Around a request; ``traceparent`` is what the caller says of his trace."""
+        ...
+
+    async def close(self) -> None:
+        """Sends what waits, for a few seconds at most."""
         ...

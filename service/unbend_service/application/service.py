@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from unbend_service.application.access import Access
 from unbend_service.application.admission import Admission
 from unbend_service.application.blocking import BlockingWork
 from unbend_service.application.budget import MemoryBudget
@@ -14,9 +15,19 @@ from unbend_service.application.estimation import Estimation
 from unbend_service.application.exchange import Exchange
 from unbend_service.application.grids import GridLibrary
 from unbend_service.application.illustration import Illustration
-from unbend_service.application.ports import Estimator, GridStore, ImageCodec, Meter, ModelInfo, PoolState, RenderPool
+from unbend_service.application.ports import (
+    Estimator,
+    GridStore,
+    ImageCodec,
+    Meter,
+    ModelInfo,
+    PoolState,
+    RenderPool,
+    Tracer,
+)
 from unbend_service.application.regions import Regions
 from unbend_service.application.streams import Streams
+from unbend_service.application.tracing import NoTracer
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,8 +75,10 @@ class Service:
     blocking: BlockingWork
     estimator: Estimator
     bodies: MemoryBudget
+    access: Access
     admission: Admission = field(default_factory=Admission)
     role: str = "all"
+    tracer: Tracer = field(default_factory=NoTracer)
     closing: tuple[Callable[[], None], ...] = ()
 
     @property
@@ -98,3 +111,4 @@ class Service:
         await self.store.close()
         for free in self.closing:
             free()
+        await self.tracer.close()

@@ -12,6 +12,7 @@ from unbend_service.cli.eval import evaluate
 from unbend_service.cli.grid import grid
 from unbend_service.cli.serve import serve
 from unbend_service.cli.show import show
+from unbend_service.cli.token import token
 from unbend_service.cli.video import video
 
 app = typer.Typer(
@@ -25,6 +26,7 @@ for verb in (serve, correct, video, show, estimate, annotate, doctor):
     app.command()(verb)
 app.command("eval")(evaluate)
 app.add_typer(grid)
+app.add_typer(token)
 
 
 def main() -> None:

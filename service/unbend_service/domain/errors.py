@@ -22,10 +22,14 @@ The tree (each leaf has a stable ``code``, which both transports put on the wire
     ├── RegionNotFound
     ├── GridConflict
     ├── NotServedHere
+    ├── Refused
+    │   ├── Unauthenticated
+    │   └── PermissionDenied
     ├── Overloaded
     │   ├── QueueFull
     │   ├── MemoryFull
     │   ├── TooManyRegions
+    │   ├── RateLimited
     │   └── TooManyStreams
     ├── Unavailable
     │   ├── Draining
@@ -211,6 +215,24 @@ class NotServedHere(UnbendError):
     code = "not_served_here"
 
 
+class Refused(UnbendError, PermissionError):
+    """The caller is not let in."""
+
+    code = "refused"
+
+
+class Unauthenticated(Refused):
+    """No token, or one that is not known (any more)."""
+
+    code = "unauthenticated"
+
+
+class PermissionDenied(Refused):
+    """A token that is known, but not for this."""
+
+    code = "permission_denied"
+
+
 class Overloaded(UnbendError):
     """The service is at one of its limits; trying later may help."""
 
@@ -233,6 +255,12 @@ class TooManyRegions(Overloaded):
     """Clients share more memory than is allowed."""
 
     code = "too_many_regions"
+
+
+class RateLimited(Overloaded):
+    """More calls of one caller than it may make."""
+
+    code = "rate_limited"
 
 
 class TooManyStreams(Overloaded):

@@ -1,5 +1,6 @@
-"use strict";
 // Shows /openapi.json as a page. All text goes through textContent: nothing of the document is taken as HTML.
+
+import { withToken } from "./token.js";
 
 function element(tag, text, ...children) {
   const made = document.createElement(tag);
@@ -82,7 +83,9 @@ function call(path, method, one, root) {
 async function show() {
   const main = document.getElementById("calls");
   try {
-    const root = await (await fetch("/openapi.json")).json();
+    const answer = await withToken((headers) => fetch("/openapi.json", { headers }));
+    if (!answer.ok) throw new Error((await answer.json()).detail);
+    const root = await answer.json();
     document.getElementById("title").textContent = `${root.info.title} API ${root.info.version}`;
     document.getElementById("about").textContent = root.info.description || "";
     for (const [path, methods] of Object.entries(root.paths)) {

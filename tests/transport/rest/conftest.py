@@ -28,6 +28,7 @@ from unbend_service.application.service import Service
 from unbend_service.application.streams import Streams
 from unbend_service.settings import Settings
 from unbend_service.transport.rest.app import create_app
+from unbend_service.wiring import build_access
 
 
 @dataclass
@@ -84,6 +85,7 @@ class Bench:
             blocking=blocking,
             estimator=self.estimator,
             bodies=MemoryBudget(settings.bodies_bytes, "bodies_bytes"),
+            access=build_access(settings, meter),
         )
         self.app = create_app(self.service, settings)
         self.client = httpx.AsyncClient(transport=httpx.ASGITransport(self.app), base_url="http://unbend")

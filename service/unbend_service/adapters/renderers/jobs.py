@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 from collections.abc import Collection, Iterator
+from contextvars import Context, copy_context
 from dataclasses import dataclass, field
 from functools import lru_cache
 
@@ -34,6 +35,7 @@ class Job:
         slot: shared memory of our own, from the first assignment to the answer.
         copied: whether the source is in the slot, or need not be.
         blame: grows with every worker that dies while it renders this very frame.
+        context: of the caller, so that what is measured counts as his.
         passed_over: how often a later frame was taken first because it suited the worker.
         turn: its place in the queue, see JobQueue.
     """
@@ -54,6 +56,7 @@ class Job:
     blame: int = 0
     passed_over: int = 0
     turn: int = 0
+    context: Context = field(default_factory=copy_context)
 
     @property
     def size_bytes(self) -> int:

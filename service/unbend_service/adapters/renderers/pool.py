@@ -259,7 +259,7 @@ class WorkerPool:
         worker.held.discard(job)
         worker.rendered += 1
         if isinstance(answer, Done):
-            self._meter.stage("render", answer.render_s)
+            job.context.run(self._meter.stage, "render", answer.render_s)
             self._mean_render_s += 0.1 * (answer.render_s - self._mean_render_s)
             self._copy_out(job)
         else:
@@ -311,7 +311,7 @@ class WorkerPool:
     def _assign(self, job: Job, worker: WorkerProcess) -> None:
         worker.held.add(job)
         if not job.copied or (job.shared is not None and not job.blame):
-            self._meter.stage("queue", asyncio.get_running_loop().time() - job.accepted_s)
+            job.context.run(self._meter.stage, "queue", asyncio.get_running_loop().time() - job.accepted_s)
         if job.copied:
             self._supervisor.send(job, worker)
             return

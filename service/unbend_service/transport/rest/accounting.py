@@ -10,7 +10,8 @@ import structlog
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from unbend_service.application.ports import Meter
+from unbend_service.application.ports import Meter, Tracer
+from unbend_service.application.tracing import NoTracer
 from unbend_service.transport.rest import problems
 
 REQUEST_ID_HEADER = "X-Request-Id"
@@ -25,13 +26,14 @@ _log = structlog.get_logger("unbend.http")
 class Accounting:
     """ASGI middleware, outermost.
 
-    Accepts ``X-Request-Id`` or makes one, logs and counts each request once it is answered, and turns what nobody
-    caught into a 500 that says nothing but the request id.
+    Accepts ``X-Request-Id`` or makes one, logs, counts and traces each request once it is answered, and turns what
+    nobody caught into a 500 that says nothing but the request id.
     """
 
-    def __init__(self, app: ASGIApp, meter: Meter) -> None:
+    def __init__(self, app: ASGIApp, meter: Meter, tracer: Tracer | None = None) -> None:
         self._app = app
         self._meter = meter
+        self._tracer = tracer or NoTracer()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -46,10 +48,19 @@ class Accounting:
             nonlocal status
             if message["type"] == "http.response.start":
                 status = message["status"]
-                MutableHeaders(scope=message)[REQUEST_ID_HEADER] = request_id
+                headers = MutableHeaders(scope=message)
+                headers[REQUEST_ID_HEADER] = request_id
+                headers["X-Content-Type-Options"] = "nosniff"
+                headers["Cross-Origin-Resource-Policy"] = "same-origin"
             await send(message)
 
-        with structlog.contextvars.bound_contextvars(request_id=request_id):
+        traceparent = Headers(scope=scope).get("traceparent")
+        with (
+            self._tracer.request("http", "HTTP", request_id, traceparent) as trace,
+            structlog.contextvars.bound_contextvars(
+                request_id=request_id, **({"trace_id": trace.trace_id} if trace.trace_id else {})
+            ),
+        ):
             try:
                 await self._app(scope, receive, send_with_id)
             except Exception:
@@ -58,13 +69,16 @@ class Accounting:
                     raise  # the answer is half sent; only the server can cut the connection
                 await problems.respond_internal(request_id)(scope, receive, send_with_id)
             finally:
+                trace.answered(_label(scope), str(status or 500), failed=(status or 500) >= 500)
                 self._account(scope, status or 500, time.perf_counter() - started)
 
     def _account(self, scope: Scope, status: int, seconds: float) -> None:
         self._meter.request("http", _label(scope), str(status), seconds)
         write = _log.debug if scope["path"] in _QUIET_PATHS else _log.info
+        caller = {"caller": scope["state"]["caller"]} if scope["state"].get("caller") else {}
         write(
             "request",
+            **caller,
             method=scope["method"],
             path=scope["path"],
             status=status,

@@ -8,8 +8,10 @@ from pydantic import BaseModel, Field
 from unbend_service.application.cameras import Cameras
 from unbend_service.application.service import Service
 from unbend_service.domain import errors
+from unbend_service.domain.access import Scope
 from unbend_service.domain.camera_record import CameraRecord
 from unbend_service.transport.rest import parameters, problems
+from unbend_service.transport.rest.guards import guarded
 
 _PIXELS = 128.0
 """Pixels of a picture that is 256 wide, per half picture width."""
@@ -32,7 +34,7 @@ class CameraBody(BaseModel):
 def router(service: Service) -> APIRouter:
     """The routes over ``service``."""
     cameras: Cameras = service.estimation.cameras
-    routes = APIRouter(prefix="/v1/cameras")
+    routes = APIRouter(prefix="/v1/cameras", dependencies=guarded(service.access, Scope.GRIDS))
 
     @routes.get(
         "/{name:path}",

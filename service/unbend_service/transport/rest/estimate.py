@@ -6,17 +6,19 @@ from fastapi import APIRouter, Request, Response
 
 from unbend_service.application.service import Service
 from unbend_service.domain import errors
+from unbend_service.domain.access import Scope
 from unbend_service.domain.fit import Fit
 from unbend_service.domain.records import Correct
 from unbend_service.transport.rest import parameters, problems
 from unbend_service.transport.rest.bodies import IMAGE_REQUEST_BODY, Bodies
 from unbend_service.transport.rest.correct import IMAGE_ERRORS
+from unbend_service.transport.rest.guards import guarded
 from unbend_service.transport.rest.provenance import GridRecordBody, json_of
 
 
 def router(service: Service, bodies: Bodies) -> APIRouter:
     """The route over ``service``."""
-    routes = APIRouter()
+    routes = APIRouter(dependencies=guarded(service.access, Scope.CORRECT))
 
     @routes.post(
         "/v1/estimate",

@@ -8,6 +8,7 @@ from fastapi import APIRouter, Query, Request, Response
 
 from unbend_service.application.service import Service
 from unbend_service.domain import errors
+from unbend_service.domain.access import Scope
 from unbend_service.domain.dense_maps import MAX_MAP_PIXELS
 from unbend_service.domain.exchange import Direction, ExportFormat, ExportOptions, ImportFormat, ImportOptions
 from unbend_service.domain.fit import Fit
@@ -15,6 +16,7 @@ from unbend_service.domain.grid import MAX_POINTS
 from unbend_service.transport.rest import parameters, problems
 from unbend_service.transport.rest.bodies import Bodies
 from unbend_service.transport.rest.grids import UPLOAD_ERRORS
+from unbend_service.transport.rest.guards import guarded
 from unbend_service.transport.rest.provenance import GridRecordBody, json_of
 
 _MAP_SIDE_PX = 1 << 16
@@ -65,7 +67,7 @@ _UPLOAD: dict[str, Any] = {
 
 def router(service: Service, bodies: Bodies) -> APIRouter:
     """The routes over ``service``."""
-    routes = APIRouter(prefix="/v1/grids")
+    routes = APIRouter(prefix="/v1/grids", dependencies=guarded(service.access, Scope.GRIDS))
 
     @routes.get(
         "/{grid_id}/export",

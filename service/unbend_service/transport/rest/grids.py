@@ -8,8 +8,10 @@ from fastapi import APIRouter, Request, Response
 
 from unbend_service.application.service import Service
 from unbend_service.domain import errors
+from unbend_service.domain.access import Scope
 from unbend_service.transport.rest import parameters, problems
 from unbend_service.transport.rest.bodies import Bodies, parse_json
+from unbend_service.transport.rest.guards import guarded
 from unbend_service.transport.rest.provenance import GridBody, GridRecordBody, GuidesBody, json_of
 
 _UPLOAD: dict[str, Any] = {
@@ -44,7 +46,7 @@ COMPONENTS = (GridBody, GuidesBody)
 
 def router(service: Service, bodies: Bodies) -> APIRouter:
     """The routes over ``service``."""
-    routes = APIRouter(prefix="/v1/grids")
+    routes = APIRouter(prefix="/v1/grids", dependencies=guarded(service.access, Scope.GRIDS))
 
     async def read_json(request: Request) -> Any:
         async with bodies.raw(request) as body:

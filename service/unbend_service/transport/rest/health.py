@@ -9,6 +9,9 @@ from fastapi import APIRouter, Response
 from pydantic import BaseModel
 
 from unbend_service.application.service import Readiness, Service
+from unbend_service.domain.access import Scope
+from unbend_service.transport.rest import problems
+from unbend_service.transport.rest.guards import guarded, public
 
 
 class RendererBody(BaseModel):
@@ -65,9 +68,9 @@ def describe(readiness: Readiness) -> dict[str, Any]:
     }
 
 
-def router(service: Service) -> APIRouter:
-    """The routes over ``service``."""
-    routes = APIRouter()
+def probes(service: Service) -> APIRouter:
+    """/livez and /readyz, open to everybody: a probe has no token."""
+    routes = APIRouter(dependencies=public())
 
     @routes.get(
         "/livez",
@@ -94,13 +97,23 @@ def router(service: Service) -> APIRouter:
         status = 200 if readiness.ready else 503
         return Response(orjson.dumps(describe(readiness)), status, media_type="application/json")
 
+    return routes
+
+
+def metrics(service: Service) -> APIRouter:
+    """/metrics."""
+    routes = APIRouter(dependencies=guarded(service.access, Scope.METRICS))
+
     @routes.get(
         "/metrics",
         summary="Counts and durations for Prometheus",
         response_class=Response,
-        responses={200: {"description": "Text format.", "content": {"text/plain": {"schema": {"type": "string"}}}}},
+        responses={
+            200: {"description": "Text format.", "content": {"text/plain": {"schema": {"type": "string"}}}},
+            **problems.responses(),
+        },
     )
-    async def metrics() -> Response:
+    async def scrape() -> Response:
         """Seconds and bytes."""
         service.meter.pool(service.pool.state())
         service.meter.model(service.model)

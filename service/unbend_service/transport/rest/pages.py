@@ -9,6 +9,8 @@ from pathlib import Path
 
 from fastapi import APIRouter, Response
 
+from unbend_service.transport.rest.guards import public
+
 WEB_FOLDER = Path(__file__).resolve().parents[2] / "web"
 
 _PAGES = {"/": "index.html", "/docs": "docs.html"}
@@ -25,7 +27,11 @@ HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
     "img-src 'self' data: blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
     "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Permissions-Policy": "camera=(), geolocation=(), microphone=(), payment=(), usb=()",
     "Cache-Control": "no-cache",
 }
 
@@ -36,7 +42,7 @@ def router(pages: dict[str, str] | None = None) -> APIRouter:
     Args:
         pages: addresses of the documents; those of the service if left out.
     """
-    routes = APIRouter(include_in_schema=False)
+    routes = APIRouter(include_in_schema=False, dependencies=public())
     for path, name in (_PAGES if pages is None else pages).items():
         _add_page(routes, path, WEB_FOLDER / name)
     for file in sorted(WEB_FOLDER.rglob("*")):

@@ -41,10 +41,14 @@ TABLE: Mapping[type[errors.UnbendError], tuple[int, str]] = {
     errors.RegionNotFound: (404, "Region not found"),
     errors.GridConflict: (409, "Grid conflict"),
     errors.NotServedHere: (501, "Not served here"),
+    errors.Refused: (403, "Refused"),
+    errors.Unauthenticated: (401, "Unauthenticated"),
+    errors.PermissionDenied: (403, "Permission denied"),
     errors.Overloaded: (429, "Overloaded"),
     errors.QueueFull: (429, "Queue full"),
     errors.MemoryFull: (429, "Memory full"),
     errors.TooManyRegions: (429, "Too many regions"),
+    errors.RateLimited: (429, "Rate limited"),
     errors.TooManyStreams: (429, "Too many streams"),
     errors.Unavailable: (503, "Unavailable"),
     errors.Draining: (503, "Draining"),
@@ -61,6 +65,11 @@ TABLE: Mapping[type[errors.UnbendError], tuple[int, str]] = {
     errors.DeadlineExceeded: (504, "Deadline exceeded"),
 }
 
+#: RFC 6750 wants the refusals of a bearer token said in a header too.
+_CHALLENGES: Mapping[type[errors.UnbendError], str] = {
+    errors.Unauthenticated: 'Bearer realm="unbend", error="invalid_token"',
+    errors.PermissionDenied: 'Bearer realm="unbend", error="insufficient_scope"',
+}
 _RETRY_AFTER_S = 1
 #: nginx's code for a caller who went away; nobody reads the answer, but it is counted.
 CLIENT_CLOSED_REQUEST = 499
@@ -116,6 +125,8 @@ def respond_to(error: errors.UnbendError, request_id: str) -> Response:
         headers["Retry-After"] = str(max(_RETRY_AFTER_S, math.ceil(error.retry_after_s or 0)))
     if status == 408:
         headers["Connection"] = "close"  # the rest of the body is not waited for
+    if type(error) in _CHALLENGES:
+        headers["WWW-Authenticate"] = _CHALLENGES[type(error)]
     return respond(
         request_id,
         status,
@@ -150,7 +161,7 @@ def raw_problem(status: int, code: str, detail: str, setting: str) -> bytes:
 
 def responses(*kinds: type[errors.UnbendError]) -> dict[int | str, dict[str, Any]]:
     """The ``responses`` of a route that raises ``kinds``, and what every route may answer, for OpenAPI."""
-    always: tuple[type[errors.UnbendError], ...] = (errors.UnbendError,)
+    always = (errors.UnbendError, errors.Unauthenticated, errors.PermissionDenied, errors.RateLimited)
     titles: dict[int, list[str]] = {}
     for kind in (*kinds, *always):
         status, title = status_and_title(kind)

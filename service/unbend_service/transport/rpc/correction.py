@@ -27,7 +27,7 @@ from unbend_service.application.streams import Streams
 from unbend_service.domain.errors import InvalidOption, ProtocolViolation
 from unbend_service.domain.frames import PixelFormat
 from unbend_service.settings import Settings
-from unbend_service.transport.rpc.calls import Context
+from unbend_service.transport.rpc.calls import Context, permitted
 from unbend_service.transport.rpc.convert import (
     ENCODED_FORMATS,
     from_record,
@@ -136,6 +136,7 @@ async def _frames(requests: AsyncIterator[Request | StreamFrame]) -> AsyncIterat
     async for request in requests:
         if not isinstance(request, StreamFrame):
             raise ProtocolViolation("A stream is opened once.", allowed="open, then frames")
+        await permitted().caller.frame()
         yield request
 
 

@@ -36,6 +36,12 @@ class HealthServicer(health_pb2_grpc.HealthServicer):  # type: ignore[misc] # gr
             await context.abort(grpc.StatusCode.NOT_FOUND, f"There is no service {request.service!r}.")
         return health_pb2.HealthCheckResponse(status=self._status(request.service))
 
+    async def List(  # noqa: N802 as above
+        self, request: health_pb2.HealthListRequest, context: Context
+    ) -> health_pb2.HealthListResponse:
+        statuses = {name: health_pb2.HealthCheckResponse(status=self._status(name)) for name in self._names}
+        return health_pb2.HealthListResponse(statuses=statuses)
+
     async def Watch(  # noqa: N802 as above
         self, request: health_pb2.HealthCheckRequest, context: Context
     ) -> None:

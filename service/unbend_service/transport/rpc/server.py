@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import grpc
-from grpc_health.v1 import health_pb2_grpc
-from grpc_reflection.v1alpha import reflection
+from collections.abc import Iterator
 
-from unbend.v1 import estimation_pb2, estimation_pb2_grpc, grid_pb2, grid_pb2_grpc
+import grpc
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection, reflection_pb2
+
+from unbend.v1 import correction_pb2, estimation_pb2, estimation_pb2_grpc, grid_pb2, grid_pb2_grpc
 from unbend_service.application.service import Service
 from unbend_service.settings import Settings
 from unbend_service.transport.rpc.calls import CallInterceptor
@@ -14,6 +16,8 @@ from unbend_service.transport.rpc.correction import SERVICE, CorrectionServicer,
 from unbend_service.transport.rpc.estimation import EstimationServicer
 from unbend_service.transport.rpc.grids import GridServicer
 from unbend_service.transport.rpc.health import HealthServicer
+from unbend_service.transport.rpc.scopes import check
+from unbend_service.transport.tls import Certificates
 
 _SERVICES = (
     estimation_pb2.DESCRIPTOR.services_by_name["EstimationService"].full_name,
@@ -50,6 +54,7 @@ def server_options(settings: Settings) -> list[tuple[str, int]]:
 
 def create_server(service: Service, settings: Settings) -> grpc.aio.Server:
     """A server with all services, not yet listening. Must be called in a running event loop."""
+    check(_methods())
     server = grpc.aio.server(
         interceptors=(CallInterceptor(service),),
         options=server_options(settings),
@@ -66,16 +71,30 @@ def create_server(service: Service, settings: Settings) -> grpc.aio.Server:
     return server
 
 
-async def start_server(service: Service, settings: Settings) -> tuple[grpc.aio.Server, int]:
-    """A server that listens, and the port that it took.
+def _methods() -> Iterator[str]:
+    """The full name of every method that the server has."""
+    for file in (estimation_pb2, correction_pb2, grid_pb2, health_pb2, reflection_pb2):
+        for service in file.DESCRIPTOR.services_by_name.values():
+            for method in service.methods:
+                yield f"/{service.full_name}/{method.name}"
+
+
+async def start_server(
+    service: Service, settings: Settings, certificates: Certificates | None = None
+) -> tuple[grpc.aio.Server, int]:
+    """A server that listens, and the port that it took; in plain text without certificates.
 
     Raises:
         OSError: the address is taken.
     """
     server = create_server(service, settings)
-    address = f"{settings.grpc_host}:{settings.grpc_port}"
+    host = f"[{settings.grpc_host}]" if ":" in settings.grpc_host else settings.grpc_host
+    address = f"{host}:{settings.grpc_port}"
     try:
-        port = server.add_insecure_port(address)
+        if certificates is None:
+            port = server.add_insecure_port(address)
+        else:
+            port = server.add_secure_port(address, certificates.grpc())
     except RuntimeError as error:
         raise OSError(f"gRPC cannot listen on {address}") from error
     await server.start()

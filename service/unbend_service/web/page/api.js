@@ -1,5 +1,7 @@
 // Calls of the service. Whatever goes wrong is thrown as an Error whose message is a sentence for people.
 
+import { withToken } from "../token.js";
+
 async function problemOf(response) {
   try {
     const { detail, allowed, setting } = await response.json();
@@ -15,7 +17,7 @@ async function problemOf(response) {
 export async function call(path, options) {
   let response;
   try {
-    response = await fetch(path, options);
+    response = await withToken((token) => fetch(path, { ...options, headers: { ...options?.headers, ...token } }));
   } catch {
     throw new Error("The service does not answer. Is it still running?");
   }
@@ -24,16 +26,20 @@ export async function call(path, options) {
 }
 
 /** The estimate of a file; `onProgress` hears the share of the upload, 0..1 (fetch could not say). */
-export function estimate(body, onProgress) {
+export async function estimate(body, onProgress) {
+  const response = await withToken((token) => uploaded(body, onProgress, token));
+  if (!response.ok) throw await problemOf(response);
+  return response.json();
+}
+
+function uploaded(body, onProgress, headers) {
   return new Promise((resolve, reject) => {
     const request = new XMLHttpRequest();
     request.open("POST", "/v1/estimate");
+    for (const [name, value] of Object.entries(headers)) request.setRequestHeader(name, value);
     request.upload.onprogress = (event) => event.lengthComputable && onProgress(event.loaded / event.total);
     request.onerror = () => reject(new Error("The service does not answer. Is it still running?"));
-    request.onload = async () => {
-      const response = new Response(request.response, { status: request.status });
-      if (response.ok) resolve(await response.json()); else reject(await problemOf(response));
-    };
+    request.onload = () => resolve(new Response(request.response, { status: request.status }));
     request.send(body);
   });
 }

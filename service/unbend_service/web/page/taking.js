@@ -1,5 +1,6 @@
 // Taking the result away: the picture, a stored grid, snippets that use it, exports.
 
+import { hasToken } from "../token.js";
 import { correct, exportFormats, exported, saveGrid } from "./api.js";
 import { derive, isEstimate, isLeftAlone, state } from "./state.js";
 
@@ -40,12 +41,14 @@ export async function downloadPicture() {
 export function snippets(id) {
   const fit = fitOption(), query = fit === "crop" ? "" : `&fit=${fit}`;
   const option = fit === "crop" ? "" : `, fit=${Number.isNaN(Number(fit)) ? `"${fit}"` : fit}`;
+  const token = hasToken() ? ' -H "Authorization: Bearer $UNBEND_TOKEN"' : ""; // the client takes it from there by itself
+  const tls = location.protocol === "https:" ? ", tls=True" : "";
   return {
-    curl: `curl -sS --data-binary @photo.jpg \\\n  '${location.origin}/v1/correct?grid_id=${id}${query}' -o straight.jpg`,
+    curl: `curl -sS --data-binary @photo.jpg${token} \\\n  '${location.origin}/v1/correct?grid_id=${id}${query}' -o straight.jpg`,
     python: [
       "import numpy as np, unbend", "from PIL import Image", "",
       'image = np.asarray(Image.open("photo.jpg").convert("RGB"))',
-      `with unbend.Client("${location.hostname}:50051") as client:`,
+      `with unbend.Client("${location.hostname}:50051"${tls}) as client:`,
       `    straight = client.correct(image, grid="${id}"${option})`,
       'Image.fromarray(straight.image).save("straight.jpg")',
     ].join("\n"),
