@@ -74,7 +74,7 @@ def start_server(*, before: tuple[str, ...] = (), **settings: str) -> Server:
 
     reader = threading.Thread(target=read, daemon=True)
     reader.start()
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 120
     while not ready.wait(0.1):
         if process.poll() is not None or time.monotonic() > deadline:
             process.kill()
