@@ -71,9 +71,9 @@ def test_the_token_stays_with_its_tab_and_nowhere_else(guarded: Guarded, visit: 
     page = visit(f"{guarded.address}docs")
     page.wait_for_selector("dialog.token")
     give(page, guarded.token)
-    page.wait_for_selector("text=/v1/correct")
+    page.wait_for_selector("summary:has-text('/v1/correct')")
     page.reload()
-    page.wait_for_selector("text=/v1/correct")
+    page.wait_for_selector("summary:has-text('/v1/correct')")
     kept = page.evaluate("() => [localStorage.length, document.cookie, location.href]")
     assert kept == [0, "", f"{guarded.address}docs"]
     fresh = visit(f"{guarded.address}docs")
