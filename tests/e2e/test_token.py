@@ -68,7 +68,8 @@ def test_the_page_asks_for_a_token_and_works_with_it(guarded: Guarded, visit: Vi
 
 
 def test_the_token_stays_with_its_tab_and_nowhere_else(guarded: Guarded, visit: Visit) -> None:
-    page = visit(f"{guarded.address}docs")
+    page = visit(guarded.address)
+    page.goto(f"{guarded.address}docs")
     page.wait_for_selector("dialog.token")
     give(page, guarded.token)
     page.wait_for_selector("summary:has-text('/v1/correct')")
@@ -76,7 +77,8 @@ def test_the_token_stays_with_its_tab_and_nowhere_else(guarded: Guarded, visit: 
     page.wait_for_selector("summary:has-text('/v1/correct')")
     kept = page.evaluate("() => [localStorage.length, document.cookie, location.href]")
     assert kept == [0, "", f"{guarded.address}docs"]
-    fresh = visit(f"{guarded.address}docs")
+    fresh = visit(guarded.address)
+    fresh.goto(f"{guarded.address}docs")
     fresh.wait_for_selector("dialog.token")
 
 
