@@ -67,21 +67,6 @@ def test_the_page_asks_for_a_token_and_works_with_it(guarded: Guarded, visit: Vi
         page.click("#download")
 
 
-def test_the_token_stays_with_its_tab_and_nowhere_else(guarded: Guarded, visit: Visit) -> None:
-    page = visit(guarded.address)
-    page.goto(f"{guarded.address}docs")
-    page.wait_for_selector("dialog.token")
-    give(page, guarded.token)
-    page.wait_for_selector("summary:has-text('/v1/correct')")
-    page.reload()
-    page.wait_for_selector("summary:has-text('/v1/correct')")
-    kept = page.evaluate("() => [localStorage.length, document.cookie, location.href]")
-    assert kept == [0, "", f"{guarded.address}docs"]
-    fresh = visit(guarded.address)
-    fresh.goto(f"{guarded.address}docs")
-    fresh.wait_for_selector("dialog.token")
-
-
 def test_whoever_has_no_token_is_told_so(guarded: Guarded, visit: Visit) -> None:
     page = visit(guarded.address)
     page.set_input_files("#file", FACADE)
