@@ -1,4 +1,4 @@
-"""`python -m training VERB`: store, train, cooldown, calibrate, export, evaluate, plot."""
+"""`python -m training VERB`: store, train, cooldown, branch, branch-cooldown, calibrate, export, evaluate, plot."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from training.picture_commands import add_branch_verbs
 from training.vgg_commands import add_verbs as add_vgg_verbs
 
 if TYPE_CHECKING:
@@ -88,6 +89,10 @@ def _parser() -> argparse.ArgumentParser:
     calibrate.add_argument("--name", default="run-cooled")
     calibrate.add_argument("--limit", type=int, default=100, help="photographs per family")
     calibrate.set_defaults(verb=_calibrate)
+
+    for verb in (export, calibrate):
+        verb.add_argument("--branch", help="checkpoint of the picture branch to go with it")
+    add_branch_verbs(verbs)
 
     evaluate = verbs.add_parser("evaluate", help="measure exported weights, or a checkpoint, on validation pictures")
     evaluate.add_argument("--weights", type=Path, help="an exported .onnx; otherwise --name's checkpoint is exported")
@@ -177,7 +182,17 @@ def _export(arguments: argparse.Namespace) -> None:
         confidence = tuple(json.loads(arguments.calibration.read_text())["weights"])
     checkpoint = Checkpoint.load(arguments.directory / f"{arguments.name}.pt")
     difference = export(checkpoint, arguments.weights, confidence=confidence, min_confidence=arguments.min_confidence)
+    _export_branch(arguments, arguments.weights)
     print(f"{arguments.weights}: {checkpoint.samples} samples, differs from torch by {difference:.1e}")
+
+
+def _export_branch(arguments: argparse.Namespace, weights: Path) -> None:
+    if arguments.branch is None:
+        return
+    from training.picture_export import export_branch
+    from training.picture_loop import BranchCheckpoint
+
+    export_branch(BranchCheckpoint.load(arguments.directory / f"{arguments.branch}.pt"), weights)
 
 
 def _calibrate(arguments: argparse.Namespace) -> None:
@@ -192,6 +207,7 @@ def _calibrate(arguments: argparse.Namespace) -> None:
     directory: Path = arguments.directory / "evaluations"
     weights = directory / f"{arguments.name}.onnx"
     export(Checkpoint.load(arguments.directory / f"{arguments.name}.pt"), weights)
+    _export_branch(arguments, weights)
     estimator = LinesetEstimator(read_card(str(weights)), arguments.threads)
     calibration = calibrate(gather(estimator, arguments.photos, arguments.limit))
     path = arguments.directory / f"{arguments.name}-calibration.json"

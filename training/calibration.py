@@ -1,7 +1,9 @@
 """The confidence: a logistic regression that turns what speaks for an estimate into the probability that the picture,
 its nonlinear part corrected, is nearer to straight than it was.
 
-Fitted on training photographs under fresh distortions, so that the validation photographs remain to check it on.
+Fitted on training photographs under fresh distortions, so that the validation photographs remain to check it on; and
+on whole ones as they are, which must not be moved. Those have mild lenses of their own, and straightening them would do
+no harm; but nobody asked for it, so a mild distortion is believed only when much speaks for it.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from training.evaluation import Measurement, measure
+from training.evaluation import WHOLE, Measurement, measure, measure_whole
 from training.protocol import photographs
 from unbend_service.adapters.estimators.lineset import LinesetEstimator
 
@@ -21,6 +23,9 @@ Float64 = npt.NDArray[np.float64]
 
 FAMILIES = ("none", "rotation", "projective", "barrel", "pincushion", "wave", "mixed", "brown", "fisheye")
 SEED = 20
+WHOLE_SHARE = 4
+"""Whole photographs for each one that is distorted."""
+WHOLE_WEIGHT = 2.0
 _RIDGE = 1e-2
 _BINS = np.array([0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.98, 1.0])
 
@@ -35,7 +40,8 @@ class Calibration:
 
 def gather(estimator: LinesetEstimator, folder: Path, limit: int) -> list[Measurement]:
     """Measurements on training photographs."""
-    return measure(estimator, photographs(folder, "train", limit), FAMILIES, seed=SEED)
+    distorted = measure(estimator, photographs(folder, "train", limit), FAMILIES, seed=SEED)
+    return distorted + measure_whole(estimator, photographs(folder, "train", WHOLE_SHARE * limit))
 
 
 def calibrate(measurements: list[Measurement]) -> Calibration:
@@ -43,11 +49,13 @@ def calibrate(measurements: list[Measurement]) -> Calibration:
     known = [m for m in measurements if m.evidence is not None]
     inputs = np.array([m.evidence.inputs() for m in known if m.evidence is not None])
     better = np.array([m.nonlinear < m.nonlinear_nothing for m in known], np.float64)
+    weight = np.array([WHOLE_WEIGHT if m.family == WHOLE else 1.0 for m in known])
     weights = np.zeros(inputs.shape[1])
     for _ in range(50):
         probability = probabilities(inputs, weights)
-        gradient = inputs.T @ (probability - better) + _RIDGE * weights
-        curvature = (inputs * (probability * (1 - probability))[:, None]).T @ inputs + _RIDGE * np.eye(len(weights))
+        gradient = inputs.T @ (weight * (probability - better)) + _RIDGE * weights
+        curvature = (inputs * (weight * probability * (1 - probability))[:, None]).T @ inputs
+        curvature += _RIDGE * np.eye(len(weights))
         step = np.linalg.solve(curvature, gradient)
         weights = weights - step
         if np.abs(step).max() < 1e-8:

@@ -19,7 +19,7 @@ one vectorised code path serve them all.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -65,6 +65,10 @@ class DistortionBatch:
     @property
     def size(self) -> int:
         return len(self.kind)
+
+    def only(self, one: int) -> DistortionBatch:
+        """The batch that holds this distortion alone."""
+        return DistortionBatch(**{field.name: getattr(self, field.name)[one : one + 1] for field in fields(self)})
 
     def straighten(self, x: Float64, y: Float64) -> tuple[Float64, Float64]:
         """Source -> target. x, y: (B, n) isotropic source coordinates; the result likewise.

@@ -30,6 +30,8 @@ Float64 = npt.NDArray[np.float64]
 PIXELS = 128.0
 _LATTICE = 25
 _FULL_LONG_SIDE_PX = 512
+WHOLE = "whole"
+"""Family of undistorted whole photographs."""
 
 
 @dataclass(frozen=True)
@@ -129,16 +131,23 @@ def _residual(backward: BackwardMap, target: Float64, truth: Float64, p: Float64
     return here - truth, jacobian.reshape(-1, 8)
 
 
-def measure_harm(estimator: Estimator, photographs: list[Bytes]) -> Float64:
-    """(n, 2): mean displacement of undistorted whole photographs by the nonlinear correction, px at 256 on the long
-    side, and the confidence."""
-    rows = []
+def measure_whole(estimator: Estimator, photographs: list[Bytes]) -> list[Measurement]:
+    """Undistorted whole photographs, 512 px on the long side: `nonlinear` is by how much the nonlinear correction would move
+    them on average, px at 256 on the long side."""
+    measurements = []
     for photograph in photographs:
         scale = _FULL_LONG_SIDE_PX / max(photograph.shape[:2])
         small = cv2.resize(photograph, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        estimate = estimator.estimate(np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.uint8))
-        rows.append((_displacement(estimate.guides, small.shape[1], small.shape[0]), estimate.confidence))
-    return np.array(rows)
+        grey = np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.uint8)
+        guides, evidence, confidence = _look(estimator, grey)
+        moved = _displacement(guides, small.shape[1], small.shape[0])
+        measurements.append(Measurement(WHOLE, 0.0, moved, 0.0, moved, evidence, confidence))
+    return measurements
+
+
+def measure_harm(estimator: Estimator, photographs: list[Bytes]) -> Float64:
+    """(n, 2): displacement of undistorted whole photographs, see `measure_whole`, and the confidence."""
+    return np.array([(m.nonlinear, m.confidence) for m in measure_whole(estimator, photographs)])
 
 
 def _displacement(guides: Guides, width: int, height: int) -> float:

@@ -19,7 +19,7 @@ from unbend_service.adapters.estimators.chain_features import FEATURES
 
 SEARCHED_LONG_SIDE_PX = 384
 LOOKS = 2
-UNCALIBRATED = (1.0, -1.0, 1.0, 0.0, 0.0, 0.0)
+UNCALIBRATED = (1.0, -1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """Weights of the confidence before it is calibrated: the displacement must outweigh the expected error."""
 PARITY_TOLERANCE = 2e-4
 """Isotropic units (0.03 px at 256) by which ONNX Runtime may differ from torch."""
@@ -46,6 +46,7 @@ def export(
         "mask": {0: "pictures", 1: "chains"},
         "nodes": {0: "pictures"},
         "spreads": {0: "pictures"},
+        "state": {0: "pictures"},
     }
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the tracing exporter is deprecated; its successor needs onnxscript
@@ -54,7 +55,7 @@ def export(
             (features, mask),
             str(weights),
             input_names=["features", "mask"],
-            output_names=["nodes", "spreads"],
+            output_names=["nodes", "spreads", "state"],
             dynamic_axes=dynamic,
             opset_version=17,
             dynamo=False,

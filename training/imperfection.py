@@ -98,6 +98,8 @@ def found(points: FlatPoints, half_extent: Float64, rng: np.random.Generator) ->
     first = np.flatnonzero(points.starts)
     owner = sample[first]
     missed_share = np.where(rng.random(size) < 0.5, rng.random(size) * 0.5, 0.0)
+    # Fields and fog: with hardly a chain to go by, the network has to learn to hold back.
+    missed_share = np.where(rng.random(size) < 0.06, rng.uniform(0.7, 0.97, size), missed_share)
     missed = rng.random(len(first)) < missed_share[owner]
     faint_share = np.where(rng.random(size) < 0.3, rng.random(size) * 0.5, 0.0)
     order = np.lexsort((points.strength[first], owner))

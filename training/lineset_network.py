@@ -135,16 +135,22 @@ class LinesetNetwork(nn.Module):
         for correction in self.heads[1:]:
             nn.init.zeros_(correction[2].weight)
 
-    def forward(self, features: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """features (B, N, F), mask (B, N) float, 1 where a chain is -> node values (B, 72), spreads (B, 74)."""
-        estimates, spreads = self.estimates(features, Layout(mask))
-        return estimates[-1], spreads
+    def forward(self, features: Tensor, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """features (B, N, F), mask (B, N) float, 1 where a chain is -> node values (B, 72), spreads (B, 74), and the
+        global state (B, global_width)."""
+        estimates, spreads, state = self.examined(features, Layout(mask))
+        return estimates[-1], spreads, state
 
     def estimates(self, features: Tensor, layout: Layout) -> tuple[list[Tensor], Tensor]:
         """Node values (B, 72) after the founding rounds and after each refinement, and the spreads of the last.
 
         features: (B, N, F), or packed (m, F), as the layout says.
         """
+        estimates, spreads, _ = self.examined(features, layout)
+        return estimates, spreads
+
+    def examined(self, features: Tensor, layout: Layout) -> tuple[list[Tensor], Tensor, Tensor]:
+        """`estimates`, and the global state (B, global_width) that they come from."""
         chains = self._embedded(features)
         state: Tensor | None = None
         estimates: list[Tensor] = []
@@ -157,7 +163,7 @@ class LinesetNetwork(nn.Module):
             if index >= self.shape.rounds - 1:
                 estimates.append(self._estimate(state, estimates))
         assert state is not None
-        return estimates, self._spreads(state, estimates[-1], layout)
+        return estimates, self._spreads(state, estimates[-1], layout), state
 
     def _embedded(self, features: Tensor) -> Tensor:
         normed = ((features - self.feature_mean) / self.feature_scale).clamp(-8, 8)

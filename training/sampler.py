@@ -7,7 +7,6 @@ through a random distortion (exactly, `distortions.bend`), and imitates what ext
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +18,7 @@ from training.homographies import natural_tilts
 from training.imperfection import FlatPoints, at_the_right_level, found, jitter
 from training.labels import evaluation_points, evaluation_weights, fit_labels
 from training.random_distortions import draw_distortions
+from training.windows import Windows, columns, draw_half_extents, draw_windows, target_view
 from unbend_service.adapters.estimators.chain_features import ChainDescriptions, ChainPoints, describe
 
 Float32 = npt.NDArray[np.float32]
@@ -26,15 +26,10 @@ Float64 = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 
-SEARCHED_LONG_SIDE_PX = (256.0, 384.0)
-"""Long side, in pixels, of the picture that the imitated extractor searches."""
 UNSEARCHED_BORDER_PX = 5.0
 LABELLED_SHARE = 4
 """Only the scales of the coefficients' errors are learned from labels, and fitting them is slow: one sample of four."""
-COARSEST_ZOOM = 0.6
-"""Photograph pixels per pixel of a 256 frame: windows may be enlarged this much, as small crops are."""
 _SEE_MARGIN = 0.07
-_BBOX_REACH = 1.9
 
 
 @dataclass(frozen=True)
@@ -57,23 +52,6 @@ class TrainingBatch:
     kind: Ints
 
 
-@dataclass(frozen=True)
-class _Windows:
-    """How stored chains become a sample's.
-
-    picture: (B,) of the store. level: (B,), the scale of that picture at which its pixels are those of the sample.
-    Isotropic picture coordinates times scale (B,) plus shift (B,) are isotropic target coordinates.
-    pixel: (B,), isotropic size of a searched pixel.
-    """
-
-    picture: Ints
-    level: Float32
-    scale_x: Float32
-    scale_y: Float32
-    shift: tuple[Float32, Float32]
-    pixel: Float32
-
-
 class Sampler:
     """Draws batches from a store; all randomness comes from the generator passed in."""
 
@@ -93,40 +71,17 @@ class Sampler:
     def draw(self, size: int, rng: np.random.Generator, kinds: Ints | None = None) -> TrainingBatch:
         """A batch of `size` samples."""
         distortions = draw_distortions(size, rng, kinds)
-        half_extent = self._half_extents(size, rng)
+        half_extent = draw_half_extents(size, self._square_share, rng)
         points = self._points(distortions, half_extent, rng)
-        source_x, source_y = evaluation_points(half_extent)
-        target_x, target_y = distortions.straighten(source_x, source_y)
-        slopes, area = _slopes(distortions, source_x, source_y, target_x, target_y)
-        weight = evaluation_weights(target_x, target_y, area, half_extent)
-        some = slice(0, max(1, size // LABELLED_SHARE))
-        labels = fit_labels(source_x[some], source_y[some], target_x[some], target_y[some], weight[some])
-        target = np.stack([target_x, target_y], -1).clip(-3, 3)
-        return TrainingBatch(
-            chains=describe(points),
-            points=points,
-            source=np.stack([source_x, source_y], -1).astype(np.float32),
-            target=target.astype(np.float32),
-            weight=weight.astype(np.float32),
-            slopes=slopes.astype(np.float32),
-            labels=labels.astype(np.float32),
-            kind=distortions.kind,
-        )
-
-    def _half_extents(self, size: int, rng: np.random.Generator) -> Float64:
-        common = rng.choice([4 / 3, 3 / 2, 16 / 9], size)
-        aspect = np.where(rng.random(size) < 0.7, common, np.exp(rng.uniform(0, math.log(2.2), size)))
-        aspect = np.where(rng.random(size) < self._square_share, 1.0, aspect)
-        short = 1 / aspect
-        portrait = rng.random(size) < 0.25
-        return np.stack([np.where(portrait, short, 1.0), np.where(portrait, 1.0, short)], 1)
+        return with_truth(points, distortions, half_extent)
 
     def _points(self, distortions: DistortionBatch, half_extent: Float64, rng: np.random.Generator) -> ChainPoints:
-        low, high, stretch = _target_view(distortions, half_extent)
-        windows = self._windows(low, high, rng)
+        low, high, stretch = target_view(distortions, half_extent)
+        picture = self._pick(distortions.size, rng)
+        windows = draw_windows(picture, self._store.size_px[picture], low, high, rng)
         points = self._gathered(windows, stretch)
-        left, top = _columns(low - _SEE_MARGIN)
-        right, bottom = _columns(high + _SEE_MARGIN)
+        left, top = columns(low - _SEE_MARGIN)
+        right, bottom = columns(high + _SEE_MARGIN)
         x, y, sample = points.x, points.y, points.sample
         points = points.kept((x > left[sample]) & (x < right[sample]) & (y > top[sample]) & (y < bottom[sample]))
         tilts = natural_tilts(distortions.size, self._tilt_share, rng)
@@ -138,7 +93,7 @@ class Sampler:
         noise = jitter(windows.pixel, rng)[points.sample] * blur
         x = x + noise * rng.standard_normal(len(x), dtype=np.float32)
         y = y + noise * rng.standard_normal(len(x), dtype=np.float32)
-        inner_x, inner_y = _columns(half_extent - UNSEARCHED_BORDER_PX * windows.pixel[:, None])
+        inner_x, inner_y = columns(half_extent - UNSEARCHED_BORDER_PX * windows.pixel[:, None])
         visible &= (np.abs(x) < inner_x[points.sample]) & (np.abs(y) < inner_y[points.sample])
         seen = points.moved(x, y).kept(visible).by_sample()
         return ChainPoints(
@@ -151,31 +106,6 @@ class Sampler:
             pixel=windows.pixel,
         )
 
-    def _windows(self, low: Float64, high: Float64, rng: np.random.Generator) -> _Windows:
-        """Where in which picture each sample looks, so that it sees the target rectangle low..high (B, 2)."""
-        size = len(low)
-        picture = self._pick(size, rng)
-        extent_px = self._store.size_px[picture]
-        span = high - low
-        # Picture pixels per isotropic unit of the target frame, at which the needed rectangle just fits the picture.
-        fitting = ((extent_px - 2) / span).min(1)
-        floor = np.minimum(fitting, COARSEST_ZOOM * 128)
-        zoom = fitting * (floor / fitting) ** rng.random(size)
-        smallest, largest = SEARCHED_LONG_SIDE_PX
-        varied = smallest * (largest / smallest) ** rng.random(size)
-        searched = np.where(rng.random(size) < 0.5, smallest, varied)
-        corner_px = 1 - extent_px / 2 + rng.random((size, 2)) * (extent_px - 2 - zoom[:, None] * span)
-        scale = extent_px.max(1) / 2 / zoom
-        mirrored = np.where(rng.random(size) < 0.5, -1, 1)
-        return _Windows(
-            picture=picture,
-            level=np.asarray(searched / 2 / zoom * np.exp(0.12 * rng.normal(size=size)), np.float32),
-            scale_x=(scale * mirrored).astype(np.float32),
-            scale_y=scale.astype(np.float32),
-            shift=_columns(low - corner_px / zoom[:, None]),
-            pixel=(2 / searched).astype(np.float32),
-        )
-
     def _pick(self, size: int, rng: np.random.Generator) -> Ints:
         if not len(self._drawn):
             return self._photographs[rng.integers(len(self._photographs), size=size)]
@@ -185,7 +115,7 @@ class Sampler:
         photographs = self._photographs[rng.integers(len(self._photographs), size=size)]
         return np.where(rng.random(size) < self._drawn_share, drawn, photographs)
 
-    def _gathered(self, windows: _Windows, stretch: Float64) -> FlatPoints:
+    def _gathered(self, windows: Windows, stretch: Float64) -> FlatPoints:
         """The stored chains of all levels that a sample may show, in its target frame; stretch: (B, 2), least and
         greatest magnification of the distortion."""
         levels = np.log(np.array(LEVELS))
@@ -214,21 +144,25 @@ class Sampler:
         )
 
 
-def _target_view(distortions: DistortionBatch, half_extent: Float64) -> tuple[Float64, Float64, Float64]:
-    """What each picture shows of its target frame: low and high corner (B, 2) of its bounding box, within
-    +-_BBOX_REACH; and the least and greatest magnification, source per target, (B, 2)."""
-    side = 11
-    steps = np.linspace(-1, 1, side)
-    grid_x, grid_y = (a.ravel() for a in np.meshgrid(steps, steps))
-    x, y = distortions.straighten(half_extent[:, :1] * grid_x, half_extent[:, 1:] * grid_y)
-    lattice = np.stack([x, y], -1).reshape(-1, side, side, 2)
-    along, down = lattice[:, :-1, 1:] - lattice[:, :-1, :-1], lattice[:, 1:, :-1] - lattice[:, :-1, :-1]
-    area = np.abs(along[..., 0] * down[..., 1] - along[..., 1] * down[..., 0]).reshape(len(x), -1)
-    cell = half_extent.prod(1)[:, None] * (2 / (side - 1)) ** 2
-    magnification = np.sqrt(cell / np.maximum(area, 1e-6)).clip(0.2, 5)
-    x, y = x.clip(-_BBOX_REACH, _BBOX_REACH), y.clip(-_BBOX_REACH, _BBOX_REACH)
-    low, high = np.stack([x.min(1), y.min(1)], 1) - 1 / 128, np.stack([x.max(1), y.max(1)], 1) + 1 / 128
-    return low, high, np.stack([magnification.min(1), magnification.max(1)], 1)
+def with_truth(points: ChainPoints, distortions: DistortionBatch, half_extent: Float64) -> TrainingBatch:
+    """The batch of pictures of half_extent (B, 2) in which the distortions left these chain points."""
+    source_x, source_y = evaluation_points(half_extent)
+    target_x, target_y = distortions.straighten(source_x, source_y)
+    slopes, area = _slopes(distortions, source_x, source_y, target_x, target_y)
+    weight = evaluation_weights(target_x, target_y, area, half_extent)
+    some = slice(0, max(1, distortions.size // LABELLED_SHARE))
+    labels = fit_labels(source_x[some], source_y[some], target_x[some], target_y[some], weight[some])
+    target = np.stack([target_x, target_y], -1).clip(-3, 3)
+    return TrainingBatch(
+        chains=describe(points),
+        points=points,
+        source=np.stack([source_x, source_y], -1).astype(np.float32),
+        target=target.astype(np.float32),
+        weight=weight.astype(np.float32),
+        slopes=slopes.astype(np.float32),
+        labels=labels.astype(np.float32),
+        kind=distortions.kind,
+    )
 
 
 def _slopes(
@@ -258,8 +192,3 @@ def _tilted(tilts: Float64, x: Float32, y: Float32, sample: Ints) -> tuple[Float
     x, y = x.copy(), y.copy()
     x[index], y[index] = new_x / depth, new_y / depth
     return x, y
-
-
-def _columns(pairs: Float64) -> tuple[Float32, Float32]:
-    """Both columns of (B, 2), contiguous, which makes looking them up for every point three times as fast."""
-    return np.ascontiguousarray(pairs[:, 0], np.float32), np.ascontiguousarray(pairs[:, 1], np.float32)

@@ -74,10 +74,31 @@ def read_card(model: str) -> ModelCard:
         raise _unavailable(f"The model {model!r} has no card {path.name!r} beside it.") from None
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise _unavailable(f"The card {path.name!r} cannot be read: {error!r}.") from error
-    found = hashlib.sha256(weights.read_bytes()).hexdigest()
-    if found != card.sha256:
-        raise _unavailable(f"The weights {weights.name!r} are not those of their card: SHA-256 {found}.")
+    _check(weights, card.sha256)
     return card
+
+
+def companion(card: ModelCard, part: str) -> Path:
+    """A second weight file of a model, ``parameters[part] = {"weights", "sha256"}``, in the folder of the first.
+
+    Raises:
+        ModelUnavailable: it is not there, or not what the card says.
+    """
+    try:
+        name, sha256 = str(card.parameters[part]["weights"]), str(card.parameters[part]["sha256"])
+    except (KeyError, TypeError) as error:
+        raise _unavailable(f"The card of {card.name!r} does not say where its {part} is: {error!r}.") from error
+    weights = card.weights.with_name(name)
+    if weights.parent != card.weights.parent or not weights.is_file():
+        raise _unavailable(f"The model {card.name!r} lacks its {part}, {name!r}.")
+    _check(weights, sha256)
+    return weights
+
+
+def _check(weights: Path, sha256: str) -> None:
+    found = hashlib.sha256(weights.read_bytes()).hexdigest()
+    if found != sha256:
+        raise _unavailable(f"The weights {weights.name!r} are not those of their card: SHA-256 {found}.")
 
 
 def _unavailable(message: str) -> ModelUnavailable:

@@ -42,6 +42,7 @@ class GuidesView:
         if not np.isfinite(self._target).all() or np.abs(self._target).max() > _FURTHEST:
             raise InvalidGuides("The guides put parts of the picture nowhere.")
         self._share = self._shares()
+        self._tangents, self._project = self._tangent_plane()
 
     def _shares(self) -> Float64:
         """(n,) by which squared target distances count, so that their mean is the squared error in source pixels over
@@ -54,6 +55,18 @@ class GuidesView:
         reach = np.abs(self._target / self._extent).max(axis=1)
         shown = np.where(reach <= 1.06, 1.0, np.where(reach <= 1.35, 0.15, 0.02))
         return np.asarray(shown / (shown * area).mean())
+
+    def _tangent_plane(self) -> tuple[Float64, Float64]:
+        """Displacements (2 n, 8) of the target by the eight infinitesimal homographies, x first, and what takes a
+        displacement to its weighted share of each, (8, 2 n)."""
+        u, v = self._target.T
+        one, zero = np.ones_like(u), np.zeros_like(u)
+        across = np.stack([one, zero, u, zero, v, zero, u * u, u * v], axis=1)
+        down = np.stack([zero, one, zero, u, zero, v, u * v, v * v], axis=1)
+        tangents = np.concatenate([across, down])
+        weighted = tangents * np.tile(self._share, 2)[:, None]
+        normal = weighted.T @ tangents + _RIDGE * len(u) * np.eye(8)
+        return tangents, np.asarray(np.linalg.solve(normal, weighted.T))
 
     def straighten(self, source: Float64) -> Float64:
         """Source (n, 2) -> target (n, 2), isotropic.
@@ -77,6 +90,18 @@ class GuidesView:
         """
         left = self._aligned(straightened)[1] - self._target
         return np.asarray(left * (PIXELS * np.sqrt(self._share))[:, None])
+
+    def residual_near(self, straightened: Float64, pose: Float64) -> Float64:
+        """`residual`, ten times faster, where the best homography is nearly ``pose`` (3, 3): right to first order in
+        what is left after it."""
+        x, y = straightened[..., 0], straightened[..., 1]
+        depth = np.maximum(x * pose[2, 0] + y * pose[2, 1] + pose[2, 2], 0.1)
+        left_x = (x * pose[0, 0] + y * pose[0, 1] + pose[0, 2]) / depth - self._target[:, 0]
+        left_y = (x * pose[1, 0] + y * pose[1, 1] + pose[1, 2]) / depth - self._target[:, 1]
+        left = np.concatenate([left_x, left_y], axis=-1)
+        left = left - (left @ self._project.T) @ self._tangents.T
+        left = left.reshape(*left.shape[:-1], 2, len(self.source))
+        return np.asarray(np.moveaxis(left, -2, -1) * (PIXELS * np.sqrt(self._share))[:, None])
 
     def pose(self, straightened: Float64) -> Float64:
         """(3, 3) homography, isotropic, that takes (n, 2) ``straightened`` nearest to the guides' targets."""

@@ -113,16 +113,22 @@ class GuideFrame:
         anchors, nodes = self.anchors, self.nodes
         down = np.einsum("nk,nd,kd->n", lagrange_basis(anchors, y), lagrange_basis(nodes, x), offset[0])
         right = np.einsum("nk,nd,kd->n", lagrange_basis(anchors, x), lagrange_basis(nodes, y), offset[1])
-        one, zero = np.ones_like(x), np.zeros_like(x)
-        tangents = np.concatenate(
-            [
-                np.stack([one, zero, x, zero, y, zero, x * x, x * y], 1),
-                np.stack([zero, one, zero, x, zero, y, x * y, y * y], 1),
-            ]
-        )
-        moved = np.concatenate([right, down])
-        rest = moved - tangents @ np.linalg.lstsq(tangents, moved, rcond=None)[0]
-        return float(np.hypot(*rest.reshape(2, -1)).mean())
+        return mean_bend(points, np.stack([right, down], 1))
+
+
+def mean_bend(points: Float64, moved: Float64) -> float:
+    """Mean length of what no infinitesimal homography explains of displacements (n, 2) of points (n, 2)."""
+    x, y = points.T
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    tangents = np.concatenate(
+        [
+            np.stack([one, zero, x, zero, y, zero, x * x, x * y], 1),
+            np.stack([zero, one, zero, x, zero, y, x * y, y * y], 1),
+        ]
+    )
+    flat = moved.T.ravel()
+    plane = np.linalg.solve(tangents.T @ tangents + 1e-9 * len(flat) * np.eye(8), tangents.T @ flat)
+    return float(np.hypot(*(flat - tangents @ plane).reshape(2, -1)).mean())
 
 
 def mirrored(values: Float64) -> Float64:

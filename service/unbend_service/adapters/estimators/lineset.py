@@ -12,6 +12,9 @@ from unbend_service.adapters.estimators.cards import ModelCard
 from unbend_service.adapters.estimators.chain_features import FEATURES, ChainPoints, describe
 from unbend_service.adapters.estimators.chains import extract, fit_long_side
 from unbend_service.adapters.estimators.isotropic_guides import GuideFrame, mirrored
+from unbend_service.adapters.estimators.picture_branch import ChainsAnswer, PictureBranch
+from unbend_service.adapters.estimators.radial import refine
+from unbend_service.adapters.estimators.radial_family import displacement_of_lens
 from unbend_service.adapters.estimators.sessions import open_session
 from unbend_service.application.ports import Bytes, Estimate, ModelInfo
 from unbend_service.domain.errors import InvalidGuides, ModelUnavailable
@@ -21,11 +24,17 @@ Float64 = npt.NDArray[np.float64]
 
 #: Fewer edge chains than this say nothing about a lens.
 FEWEST_CHAINS = 4
-INPUTS = 6
+INPUTS = 8
 #: Pixels of a 256 picture per half picture width.
 _PIXELS = 128.0
 #: Displacement from which a second look pays: it takes a fifth off the error of strong lenses, and unsettles the rest.
 SECOND_LOOK_FROM_PX = 2.0
+#: Where less is to be done, no lens is looked for.
+LEAST_DISPLACEMENT_PX = 0.15
+#: A radial lens takes the place of the guides when it is at least this probable, and the guides were not a mere guess:
+#: where chains say little a lens of a few numbers is as wrong as any, and surer of itself.
+RADIAL_FROM = 0.6
+LENSES_UP_TO_PX = 1.5
 #: Straightened points further out than this, in half extents of the picture, are not looked at again.
 _SECOND_LOOK_EXTENT = 1.3
 
@@ -39,19 +48,24 @@ class Evidence:
         displacement: mean displacement of the nonlinear part of the estimate.
         disagreement: mean difference of the nonlinear parts estimated from the picture and from its mirror image.
         chains: edge chains that were looked at.
+        radial, straight: probabilities that the distortion is that of a radial lens, and that there is none.
     """
 
     expected_error: float
     displacement: float
     disagreement: float
     chains: int
+    radial: float
+    straight: float
 
     def inputs(self) -> Float64:
         """(INPUTS,) float64: the inputs of the logistic regression of the card, the first of them 1."""
         error = math.log(max(self.expected_error, 0.01))
         size = math.log(max(self.displacement, 0.01))
         apart = math.log(max(self.disagreement, 0.01))
-        return np.array([1.0, error, size, apart, math.log1p(self.chains), max(size - error, 0.0)])
+        return np.array(
+            [1.0, error, size, apart, math.log1p(self.chains), max(size - error, 0.0), self.radial, self.straight]
+        )
 
 
 class LinesetEstimator:
@@ -89,6 +103,7 @@ class LinesetEstimator:
         if self._weights.shape != (INPUTS,):
             raise ModelUnavailable(f"The card of {card.name!r} needs {INPUTS} confidence weights.", setting="model")
         self._session = open_session(card.weights, threads)
+        self._branch = PictureBranch(card, threads) if "branch" in card.parameters else None
         features = self._session.get_inputs()[0].shape
         values = self._session.get_outputs()[0].shape
         if features[-1] != FEATURES or values[-1] != self._frame.straight.size:
@@ -134,10 +149,11 @@ class LinesetEstimator:
     def examine(self, grey: Bytes) -> tuple[Guides, Evidence | None]:
         """The guides of a (height, width) uint8 picture and what speaks for them; straight guides and None where
         there are too few edges to say anything."""
-        chains = extract(fit_long_side(grey, self._long_side_px))
+        picture = fit_long_side(grey, self._long_side_px)
+        chains = extract(picture)
         points = ChainPoints.of(chains)
         extent = (chains.half_width, chains.half_height)
-        seen = self._look(points)
+        seen = self._look(points, picture)
         if seen is None:
             return Guides.straight(), None
         values = seen.values
@@ -145,31 +161,46 @@ class LinesetEstimator:
         if self._looks > 1 and displacement > SECOND_LOOK_FROM_PX:
             values = self._second_look(points, values, extent)
             displacement = self._displacement(values, extent)
+        guides, error = self._frame.guides(values, *extent), seen.expected_error
+        radial, straight = 0.0, 0.0
+        if displacement > LEAST_DISPLACEMENT_PX:
+            weighed = refine(chains, guides, error)
+            radial, straight = weighed.probabilities["radial"], weighed.probabilities["identity"]
+            if weighed.lens is not None and radial > RADIAL_FROM and error < LENSES_UP_TO_PX:
+                guides, error = weighed.guides, weighed.expected_error
+                displacement = displacement_of_lens(weighed.lens, *extent) * _PIXELS
         evidence = Evidence(
-            expected_error=seen.expected_error,
+            expected_error=error,
             displacement=displacement,
             disagreement=self._frame.bend(seen.difference, *extent) * _PIXELS,
             chains=seen.chains,
+            radial=radial,
+            straight=straight,
         )
-        return self._frame.guides(values, *extent), evidence
+        return guides, evidence
 
     def _displacement(self, values: Float64, extent: tuple[float, float]) -> float:
         return self._frame.bend(values - self._frame.straight, *extent) * _PIXELS
 
-    def _look(self, points: ChainPoints) -> _Look | None:
-        """What the network says of chains and of their mirror image; None if there are too few."""
+    def _look(self, points: ChainPoints, picture: Bytes | None = None) -> _Look | None:
+        """What the networks say of chains, and of the picture if it is to be looked at, and of their mirror images;
+        None if there is too little to say anything."""
         direct, reflected = describe(points), describe(points.mirrored())
         slots = max(len(direct.features), len(reflected.features))
-        if slots < FEWEST_CHAINS:
+        branch = None if picture is None else self._branch
+        if slots < FEWEST_CHAINS and branch is None:
             return None
-        pairs = [described.padded(slots) for described in (direct, reflected)]
-        values, spreads = self._session.run(
-            ["nodes", "spreads"],
-            {"features": np.concatenate([p[0] for p in pairs]), "mask": np.concatenate([p[1] for p in pairs])},
-        )
-        one, other = np.asarray(values, dtype=np.float64).reshape(2, *self._frame.straight.shape)
+        pairs = [described.padded(max(slots, 1)) for described in (direct, reflected)]
+        told = {"features": np.concatenate([p[0] for p in pairs]), "mask": np.concatenate([p[1] for p in pairs])}
+        if branch is None or picture is None:
+            nodes, spreads = (np.asarray(output) for output in self._session.run(["nodes", "spreads"], told))
+            log_errors = spreads[:, -2:]
+        else:
+            answer = ChainsAnswer(*map(np.asarray, self._session.run(["nodes", "spreads", "state"], told)))
+            nodes, log_errors = branch.fused(picture, answer)
+        one, other = nodes.astype(np.float64).reshape(2, *self._frame.straight.shape)
         other = mirrored(other)
-        expected_error = float(np.exp(np.clip(np.asarray(spreads)[:, -1], -4, 5).mean()))
+        expected_error = float(np.exp(np.clip(log_errors[:, -1], -4, 5).mean()))
         return _Look((one + other) / 2, (one - other) / 2, expected_error, len(direct.features))
 
     def _second_look(self, points: ChainPoints, values: Float64, extent: tuple[float, float]) -> Float64:

@@ -53,14 +53,14 @@ PRIOR_SPREAD: Float64 = np.array([0.25, 0.06, 0.06, 0.06])
 
 _CENTRED = np.array([0])
 _FREE = np.array([0, 1, 2, 3])
-_SCAN = np.linspace(-0.4, 0.42, 21)
+_SCAN = np.linspace(-0.4, 0.42, 15)
 _CENTRES: Float64 = 0.08 * np.stack(np.meshgrid([0.0, -1.0, 1.0], [0.0, -1.0, 1.0]), axis=-1).reshape(-1, 2)
 _STRONG_PINCUSHION = 0.1
 _STRONG_POSE = 0.15
 _STEPS = np.array([1e-3, 1e-3, 2e-3, 2e-3])
-_ROUNDS = 12
-_SHARPENING_ROUNDS = 6
-_SETTLED = 1e-2
+_ROUNDS = 7
+_SHARPENING_ROUNDS = 4
+_SETTLED = 3e-2
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,6 +171,7 @@ class _Model:
         self._error = error
         self._count = len(view.source)
         self._points = np.concatenate([plumbline.nodes, view.source])
+        self._pose: Float64 | None = None
 
     def scan(self) -> tuple[Float64, Float64]:
         """Of centred one-number lenses, each (4,): the best of a coarse scan, and the one nearest to the guides alone
@@ -204,6 +205,7 @@ class _Model:
 
     def fit(self, start: Float64, free: npt.NDArray[np.int64]) -> _Hypothesis:
         """The most probable lens with the ``free`` parameters, and its evidence, by Levenberg-Marquardt."""
+        self._pose = self._view.pose(straighten(start, self._view.source))
         state = self._around(start, free)
         damping, normal = 1e-3, np.eye(len(free))
         for _ in range(_ROUNDS):
@@ -264,7 +266,8 @@ class _Model:
     def _look(self, lenses: Float64) -> _State:
         straightened = straighten(lenses, self._points)
         bends = self._plumbline.bends(straightened[:, : -self._count])
-        residual = self._view.residual(straightened[:, -self._count :])
+        seen = straightened[:, -self._count :]
+        residual = self._view.residual(seen) if self._pose is None else self._view.residual_near(seen, self._pose)
         far = (residual**2).sum(-1).mean(-1)
         cost = 0.5 * ((lenses / PRIOR_SPREAD) ** 2).sum(-1) - self._plumbline.log_likelihood(bends)
         cost += 0.5 * (NU + DIMENSIONS) * np.log1p(far / (NU * self._error**2))

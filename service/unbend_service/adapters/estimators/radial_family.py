@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from unbend_service.adapters.estimators.isotropic_guides import mean_bend
 from unbend_service.domain.guides import GuideFamily, Guides, anchor_basis, power_basis
 from unbend_service.domain.homography import apply_homography
 from unbend_service.domain.maps import Float64, target_lattice
@@ -50,6 +51,13 @@ def is_lens(parameters: Float64) -> npt.NDArray[np.bool_]:
     growth = 1 - _SQUARES * (first + 3 * _SQUARES * second)
     within = (denominator > _LEAST_DENOMINATOR) & (growth > _LEAST_GROWTH)
     return np.asarray(within.all(-1) & (np.abs(parameters[..., 2:]) < _FURTHEST_CENTRE).all(-1))
+
+
+def displacement_of_lens(parameters: Float64, half_width: float, half_height: float) -> float:
+    """Mean displacement, isotropic, of what no infinitesimal homography explains of the lens (4,)."""
+    points = target_lattice(13, 13).reshape(-1, 2) * (half_width, half_height)
+    moved = _continued(parameters, points) - points
+    return mean_bend(points, moved)
 
 
 def guides_of_lens(parameters: Float64, pose: Float64, half_width: float, half_height: float) -> Guides:
