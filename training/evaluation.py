@@ -132,8 +132,8 @@ def _residual(backward: BackwardMap, target: Float64, truth: Float64, p: Float64
 
 
 def measure_whole(estimator: Estimator, photographs: list[Bytes]) -> list[Measurement]:
-    """Undistorted whole photographs, 512 px on the long side: `nonlinear` is by how much the nonlinear correction would move
-    them on average, px at 256 on the long side."""
+    """Undistorted whole photographs, 512 px on the long side: `nonlinear` is by how much the nonlinear correction would
+    move them on average, px at 256 on the long side."""
     measurements = []
     for photograph in photographs:
         scale = _FULL_LONG_SIDE_PX / max(photograph.shape[:2])
