@@ -9,14 +9,16 @@ no harm; but nobody asked for it, so a mild distortion is believed only when muc
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
 from training.evaluation import WHOLE, Measurement, measure, measure_whole
-from training.protocol import photographs
+from training.protocol import Bytes, photographs
 from unbend_service.adapters.estimators.lineset import LinesetEstimator
 
 Float64 = npt.NDArray[np.float64]
@@ -41,7 +43,20 @@ class Calibration:
 def gather(estimator: LinesetEstimator, folder: Path, limit: int) -> list[Measurement]:
     """Measurements on training photographs."""
     distorted = measure(estimator, photographs(folder, "train", limit), FAMILIES, seed=SEED)
-    return distorted + measure_whole(estimator, photographs(folder, "train", WHOLE_SHARE * limit))
+    whole = measure_whole(estimator, photographs(folder, "train", WHOLE_SHARE * limit))
+    return distorted + whole + measure_whole(estimator, list(_textures(limit)))
+
+
+def _textures(count: int) -> Iterator[Bytes]:
+    """Colour pictures of nothing: noise of all grains, as of foliage, water and cloth."""
+    rng = np.random.default_rng(SEED)
+    for _ in range(count):
+        height, width = int(rng.integers(280, 512)), int(rng.integers(280, 512))
+        noise = rng.standard_normal((height, width)).astype(np.float32)
+        grain = float(np.exp(rng.uniform(np.log(1.0), np.log(12.0))))
+        stretched = cv2.GaussianBlur(noise, (0, 0), grain * float(rng.uniform(0.6, 1.6)), sigmaY=grain)
+        grey = (128 + 60 * stretched / stretched.std()).clip(0, 255).astype(np.uint8)
+        yield np.repeat(grey[..., None], 3, axis=2)
 
 
 def calibrate(measurements: list[Measurement]) -> Calibration:

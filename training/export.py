@@ -19,7 +19,7 @@ from unbend_service.adapters.estimators.chain_features import FEATURES
 
 SEARCHED_LONG_SIDE_PX = 384
 LOOKS = 2
-UNCALIBRATED = (1.0, -1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+UNCALIBRATED = (1.0, -1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """Weights of the confidence before it is calibrated: the displacement must outweigh the expected error."""
 PARITY_TOLERANCE = 2e-4
 """Isotropic units (0.03 px at 256) by which ONNX Runtime may differ from torch."""

@@ -61,7 +61,7 @@ def test_guides_fitted_to_the_truth_have_hardly_an_error(family: str) -> None:
 
 def measurement(error: float, displacement: float, *, better: bool) -> Measurement:
     return Measurement(
-        "barrel", 5.0, 2.0, 2.0, 1.0 if better else 3.0, Evidence(error, displacement, 0.1, 50, 0.0, 0.0), 0.9
+        "barrel", 5.0, 2.0, 2.0, 1.0 if better else 3.0, Evidence(error, displacement, 0.1, 50, 0.1, 0.0, 0.0), 0.9
     )
 
 
@@ -70,7 +70,7 @@ def test_calibration_learns_what_speaks_for_an_estimate() -> None:
     rng = np.random.default_rng(0)
     measurements = [measurement(e, d, better=d > 1.5 * e) for e, d in np.exp(rng.normal(size=(400, 2)))]
     weights = np.array(calibrate(measurements).weights)
-    sure, unsure = Evidence(0.1, 3.0, 0.1, 50, 0.0, 0.0), Evidence(3.0, 0.1, 0.1, 50, 0.0, 0.0)
+    sure, unsure = Evidence(0.1, 3.0, 0.1, 50, 0.1, 0.0, 0.0), Evidence(3.0, 0.1, 0.1, 50, 0.1, 0.0, 0.0)
     assert sure.inputs() @ weights > 2
     assert unsure.inputs() @ weights < -2
 

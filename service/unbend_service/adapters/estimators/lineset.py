@@ -24,7 +24,7 @@ Float64 = npt.NDArray[np.float64]
 
 #: Fewer edge chains than this say nothing about a lens.
 FEWEST_CHAINS = 4
-INPUTS = 8
+INPUTS = 9
 #: Pixels of a 256 picture per half picture width.
 _PIXELS = 128.0
 #: Displacement from which a second look pays: it takes a fifth off the error of strong lenses, and unsettles the rest.
@@ -48,6 +48,7 @@ class Evidence:
         displacement: mean displacement of the nonlinear part of the estimate.
         disagreement: mean difference of the nonlinear parts estimated from the picture and from its mirror image.
         chains: edge chains that were looked at.
+        departure: mean difference of the nonlinear parts that the chains alone and the networks together suggest.
         radial, straight: probabilities that the distortion is that of a radial lens, and that there is none.
     """
 
@@ -55,6 +56,7 @@ class Evidence:
     displacement: float
     disagreement: float
     chains: int
+    departure: float
     radial: float
     straight: float
 
@@ -63,9 +65,9 @@ class Evidence:
         error = math.log(max(self.expected_error, 0.01))
         size = math.log(max(self.displacement, 0.01))
         apart = math.log(max(self.disagreement, 0.01))
-        return np.array(
-            [1.0, error, size, apart, math.log1p(self.chains), max(size - error, 0.0), self.radial, self.straight]
-        )
+        parted = math.log(max(self.departure, 0.01))
+        surplus, chains = max(size - error, 0.0), math.log1p(self.chains)
+        return np.array([1.0, error, size, apart, chains, surplus, self.radial, self.straight, parted])
 
 
 class LinesetEstimator:
@@ -174,6 +176,7 @@ class LinesetEstimator:
             displacement=displacement,
             disagreement=self._frame.bend(seen.difference, *extent) * _PIXELS,
             chains=seen.chains,
+            departure=self._frame.bend(seen.departure, *extent) * _PIXELS,
             radial=radial,
             straight=straight,
         )
@@ -188,20 +191,22 @@ class LinesetEstimator:
         direct, reflected = describe(points), describe(points.mirrored())
         slots = max(len(direct.features), len(reflected.features))
         branch = None if picture is None else self._branch
-        if slots < FEWEST_CHAINS and branch is None:
+        if slots < FEWEST_CHAINS:
             return None
-        pairs = [described.padded(max(slots, 1)) for described in (direct, reflected)]
+        pairs = [described.padded(slots) for described in (direct, reflected)]
         told = {"features": np.concatenate([p[0] for p in pairs]), "mask": np.concatenate([p[1] for p in pairs])}
+        shape = (2, *self._frame.straight.shape)
         if branch is None or picture is None:
             nodes, spreads = (np.asarray(output) for output in self._session.run(["nodes", "spreads"], told))
-            log_errors = spreads[:, -2:]
+            log_errors, departure = spreads[:, -2:], np.zeros(shape[1:])
         else:
             answer = ChainsAnswer(*map(np.asarray, self._session.run(["nodes", "spreads", "state"], told)))
             nodes, log_errors = branch.fused(picture, answer)
-        one, other = nodes.astype(np.float64).reshape(2, *self._frame.straight.shape)
+            departure = (nodes - answer.nodes)[0].reshape(shape[1:]).astype(np.float64)
+        one, other = nodes.astype(np.float64).reshape(shape)
         other = mirrored(other)
         expected_error = float(np.exp(np.clip(log_errors[:, -1], -4, 5).mean()))
-        return _Look((one + other) / 2, (one - other) / 2, expected_error, len(direct.features))
+        return _Look((one + other) / 2, (one - other) / 2, departure, expected_error, len(direct.features))
 
     def _second_look(self, points: ChainPoints, values: Float64, extent: tuple[float, float]) -> Float64:
         """The values after looking at the chains that `values` straighten; unchanged where that is of no use."""
@@ -218,9 +223,11 @@ class LinesetEstimator:
 
 @dataclass(frozen=True, slots=True)
 class _Look:
-    """Mean of what the picture and its mirror image say, half their difference (2, K, degree + 1), and the rest."""
+    """Mean of what the picture and its mirror image say, half their difference, how far the picture branch departed
+    from the chains (each (2, K, degree + 1)), and the rest."""
 
     values: Float64
     difference: Float64
+    departure: Float64
     expected_error: float
     chains: int

@@ -58,9 +58,9 @@ _CENTRES: Float64 = 0.08 * np.stack(np.meshgrid([0.0, -1.0, 1.0], [0.0, -1.0, 1.
 _STRONG_PINCUSHION = 0.1
 _STRONG_POSE = 0.15
 _STEPS = np.array([1e-3, 1e-3, 2e-3, 2e-3])
-_ROUNDS = 7
-_SHARPENING_ROUNDS = 4
-_SETTLED = 3e-2
+_ROUNDS = 9
+_SHARPENING_ROUNDS = 6
+_SETTLED = 1e-2
 
 
 @dataclass(frozen=True, slots=True)
