@@ -57,13 +57,16 @@ proto: setup-dev  ## Generate client/unbend/v1 from proto/
 
 .PHONY: help setup setup-dev serve test e2e check proto
 
+manifests: $(VENV)/.deploy  ## Render and check the Helm chart; write deploy/kubernetes
+	$(BIN)/python -m deploy.checks.chart
+
 check-deploy: $(VENV)/.deploy  ## Check image, compose, chart, rules and dashboard (Debian: prometheus, haproxy)
 	$(BIN)/python -m pytest -m deploy tests/deploy
 
 verify-dashboard: setup-dev  ## Run every query of the dashboard against the real service and a real Prometheus
 	$(BIN)/python -m deploy.checks.dashboard
 
-.PHONY: check-deploy verify-dashboard
+.PHONY: manifests check-deploy verify-dashboard
 
 scan: setup-dev  ## Try every route and RPC without a token, with a wrong one, and with one of the wrong scope
 	$(BIN)/python -m tests.access.scan

@@ -42,6 +42,11 @@ def test_alerts_fire_when_they_should_and_only_then() -> None:
     promtool("test", "rules", *sorted((ROOT / "deploy/prometheus/tests").glob("*.yml")))
 
 
+@needs_prometheus
+def test_prometheus_takes_the_configuration_of_the_compose_file() -> None:
+    promtool("check", "config", "--syntax-only", ROOT / "deploy/compose/prometheus.yml")
+
+
 @pytest.mark.parametrize("alert", ALERTS, ids=lambda alert: alert["alert"])
 def test_an_alert_has_a_test_and_a_page_that_says_what_to_do(alert: dict[str, object]) -> None:
     name = alert["alert"]
