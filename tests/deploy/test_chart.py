@@ -117,6 +117,24 @@ def test_memory_that_is_a_file_system_is_part_of_the_limit(manifests: list[Manif
         assert limit >= files + frames + 1024
 
 
+def test_what_callers_can_make_it_hold_fits_into_the_memory_of_its_processes(manifests: list[Manifest]) -> None:
+    for pod in pods(manifests):
+        limit = mebibytes(container(pod)["resources"]["limits"]["memory"]) << 20
+        given = {name: int(value) for name, value in environment(pod).items() if value.isdigit()}
+        files = 2 * (64 << 20) + given["UNBEND_SHARED_MEMORY_BYTES"]
+        pictures = given["UNBEND_PICTURES_BYTES"] + given["UNBEND_BODIES_BYTES"]
+        decoding = given["UNBEND_DECODERS"] * given["UNBEND_DECODE_MEMORY_BYTES"]
+        assert decoding + pictures <= 3 * (limit - files) // 4
+        assert given["UNBEND_DECODE_MEMORY_BYTES"] >= 512 << 20  # a photograph of 100 million pixels
+
+
+@pytest.mark.parametrize(("asked", "cores"), [("2", 2), ("0.5", 1), ("2500m", 3)])
+def test_a_pod_starts_as_many_processes_as_it_asks_for_cores_and_not_as_its_node_has(asked: str, cores: int) -> None:
+    (pod,) = pods(chart.render({"components": {"all": {"cpu": asked}}}))
+    for name in ("UNBEND_WORKERS", "UNBEND_DECODERS", "UNBEND_ESTIMATOR_THREADS"):
+        assert environment(pod)[name] == str(cores)
+
+
 def test_the_environment_names_settings_that_exist(manifests: list[Manifest]) -> None:
     known = {f"UNBEND_{name.upper()}" for name in Settings.model_fields}
     for pod in pods(manifests):
@@ -189,6 +207,18 @@ def test_with_tls_the_kubelet_asks_the_listener_for_health_because_it_cannot_ask
     for name, path in {"startup": "/readyz", "readiness": "/readyz", "liveness": "/livez"}.items():
         assert container(pod)[f"{name}Probe"]["httpGet"] == {"path": path, "port": "ops", "scheme": "HTTPS"}
     assert environment(pod)["UNBEND_TLS_CLIENT_CA"] == "/etc/unbend/tls/ca.crt"
+
+
+def test_with_tls_prometheus_asks_each_component_in_the_way_it_speaks() -> None:
+    values = chart.values_of("split") | {"tls": {"existingSecret": "unbend-tls"}}
+    manifests = chart.render(values)
+    (monitor,) = of_kind(manifests, "ServiceMonitor").values()
+    chart.check(monitor)
+    asked = {each["relabelings"][0]["regex"]: each["scheme"] for each in monitor["spec"]["endpoints"]}
+    assert asked == {"true": "https", "false": "http"}
+    for pod in pods(manifests):
+        scheme = "https" if "UNBEND_TLS_CERT" in environment(pod) else "http"
+        assert asked[pod["metadata"]["labels"]["unbend/front"]] == scheme
 
 
 @pytest.mark.parametrize(

@@ -30,11 +30,22 @@ app.kubernetes.io/instance: {{ .Release.Name }}
 {{- end -}}
 
 {{/* Environment of one component, as a map: what the chart derives, then what the values say. The pause before SIGTERM is
-     the notice that load balancers get, so the service need not give another. */}}
+     the notice that load balancers get, so the service need not give another. There is no limit of cores to count them by, so
+     the pod would start a process for each of the node; and what pictures may take has to fit into the limit of memory. */}}
 {{- define "unbend.environment" -}}
 {{- $root := .root -}}
 {{- $c := .component -}}
+{{- $cpu := toString $c.cpu -}}
+{{- $asked := hasSuffix "m" $cpu | ternary (divf (trimSuffix "m" $cpu) 1000) (float64 $cpu) -}}
+{{- $cores := int64 (ceil $asked) -}}
+{{- $processes := mul $c.memory.processesMiB 1048576 -}}
 {{- $env := dict
+  "UNBEND_WORKERS" (gt (int $c.gpus) 0 | ternary (min $cores 4) $cores | toString)
+  "UNBEND_DECODERS" (toString $cores)
+  "UNBEND_ESTIMATOR_THREADS" (toString $cores)
+  "UNBEND_PICTURES_BYTES" (div $processes 4 | toString)
+  "UNBEND_BODIES_BYTES" (div $processes 8 | toString)
+  "UNBEND_DECODE_MEMORY_BYTES" (div (mul $processes 3) (mul $cores 8) | toString)
   "UNBEND_ROLE" $c.role
   "UNBEND_DRAIN_NOTICE_S" "0"
   "UNBEND_DRAIN_S" (toString $root.Values.drainSeconds)
