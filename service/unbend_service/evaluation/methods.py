@@ -67,7 +67,7 @@ def model_method(estimator: Estimator, name: str | None = None) -> Method:
         started = time.perf_counter()
         estimate = estimator.estimate(case.picture)
         seconds = time.perf_counter() - started
-        return _decided(
+        return decided(
             estimate.guides,
             estimate.confidence,
             threshold,
@@ -84,7 +84,7 @@ def guides_method(name: str, examine: Callable[[Case], Guides]) -> Method:
     def look(case: Case) -> Look:
         started = time.perf_counter()
         guides = examine(case)
-        return _decided(guides, 1.0, 0.0, None, time.perf_counter() - started)
+        return decided(guides, 1.0, 0.0, None, time.perf_counter() - started)
 
     return Method(name, look, 0.0)
 
@@ -125,9 +125,10 @@ def knowing_the_truth() -> Method:
     return Method("the true map", look, 0.0)
 
 
-def _decided(
+def decided(
     guides: Guides, confidence: float, threshold: float, expected_error_px: float | None, seconds: float
 ) -> Look:
+    """An estimate as the service decides on it."""
     lens, everything = (
         decide(guides, confidence, "", "", correct=correct, min_confidence=0.0, points=GRID_POINTS)
         for correct in (Correct.NONLINEAR, Correct.ALL)

@@ -12,6 +12,7 @@ import numpy as np
 from unbend_service.evaluation import suites, tables
 from unbend_service.evaluation.figures import Gallery, reliability_plot, threshold_plot
 from unbend_service.evaluation.lenses import is_straight
+from unbend_service.evaluation.one_camera import camera_rows, camera_table
 from unbend_service.evaluation.suites import Measurement
 
 REPORT, RESULTS = "report.md", "results.json"
@@ -20,6 +21,7 @@ _TITLES = {
     suites.NO_HARM: "Undistorted photographs",
     suites.REAL_LENSES: "Real lenses",
     suites.OBLIQUE: "Oblique and upright views",
+    suites.ONE_CAMERA: "Ten pictures of one camera",
     suites.TABLE_ONE: "The paper's first table",
 }
 
@@ -67,6 +69,8 @@ class Evaluation:
             return tables.lens_table(measurements)
         if suite == suites.OBLIQUE:
             return tables.oblique_table(measurements)
+        if suite == suites.ONE_CAMERA:
+            return camera_table(measurements)
         if suite == suites.NO_HARM:
             bent = self.measured.get(suites.SYNTHETIC, {}).get(method, [])
             return tables.no_harm_table(measurements, bent)
@@ -141,6 +145,9 @@ def _figures(suite: str, measurements: list[Measurement]) -> dict[str, float]:
         }
     if suite == suites.TABLE_ONE:
         return {}
+    if suite == suites.ONE_CAMERA:
+        _, _, alone, fused = zip(*camera_rows(measurements), strict=True)
+        return {"one_camera_ratio": float(np.mean(fused) / np.mean(alone))}
     figures = {}
     for family, own in tables.groups(measurements).items():
         figures[f"all_{family}_px"] = float(np.mean([m.error_px for m in own]))

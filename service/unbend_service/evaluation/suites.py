@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -19,9 +19,11 @@ from unbend_service.evaluation.lenses import lens_cases
 from unbend_service.evaluation.measures import as_rendered, displacement_px, map_errors, ssim_and_mse
 from unbend_service.evaluation.methods import Look, Method
 from unbend_service.evaluation.oblique import oblique_cases
+from unbend_service.evaluation.one_camera import TOGETHER, camera_cases, together
 
 SYNTHETIC, NO_HARM, REAL_LENSES, OBLIQUE, TABLE_ONE = "synthetic", "no-harm", "real-lenses", "oblique", "table-1"
-SUITES = (SYNTHETIC, NO_HARM, REAL_LENSES, OBLIQUE, TABLE_ONE)
+ONE_CAMERA = "one-camera"
+SUITES = (SYNTHETIC, NO_HARM, REAL_LENSES, OBLIQUE, ONE_CAMERA, TABLE_ONE)
 _WHOLE_LONG_SIDE_PX = 512
 
 
@@ -86,6 +88,8 @@ def run_suite(
         scenes: more straight pictures for the oblique suite.
         quality: whether SSIM and MSE are measured where there is an original.
     """
+    if name == ONE_CAMERA:
+        return {method.name: list(_cameras(method, photographs)) for method in methods}
     cases: Iterator[Case]
     if name == SYNTHETIC:
         cases = (case for family in families for case in family_cases(family, photographs))
@@ -110,6 +114,15 @@ def run_suite(
             if witness is not None and method is methods[0]:
                 witness(case, look, measurement)
     return measured
+
+
+def _cameras(method: Method, photographs: list[Photograph]) -> Iterator[Measurement]:
+    for cases in camera_cases(photographs):
+        looks = [method.look(case) for case in cases]
+        for case, look in zip(cases, looks, strict=True):
+            yield measure(case, look, quality=False)
+        fused = measure(cases[0], together(looks, method), quality=False)
+        yield replace(fused, group=cases[0].group + TOGETHER)
 
 
 def errors_of_nothing(case: Case) -> tuple[float, float]:
