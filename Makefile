@@ -86,7 +86,7 @@ docs: setup-dev  ## Write the tables of settings in README.md and docs/configura
 .PHONY: docs
 
 MACHINE ?= $(shell hostname)
-BENCHES := bench-render bench-stream bench-http bench-estimate bench-startup bench-scale bench-replicas
+BENCHES := bench-render bench-stream bench-http bench-estimate bench-startup bench-scale bench-replicas bench-video
 
 $(BENCHES) bench-memory: bench-%: setup-dev
 	$(BIN)/python -m benchmarks $* --json benchmarks/results/$(MACHINE)/$*.json
@@ -98,6 +98,7 @@ bench-estimate:  ## Measure round trips of estimates
 bench-startup:  ## Measure the start of the service and the import of the client
 bench-scale:  ## Measure sizes from 256 x 256 to 7680 x 4320, and up to 10,000 grids
 bench-replicas:  ## Measure 1, 2 and 4 replicas behind HAProxy: cost of a frame, spread, failover
+bench-video:  ## Measure `unbend video` beside ffmpeg's remap filter, and what a minute of video keeps
 bench-memory:  ## Watch the memory of every process for 30 minutes of mixed load
 bench: $(BENCHES) bench-summary  ## Measure everything
 

@@ -18,6 +18,7 @@ from benchmarks import (
     startup,
     stream,
     summary,
+    video,
 )
 
 SUITES = {
@@ -29,6 +30,7 @@ SUITES = {
     "scale": scale,
     "replicas": replicas,
     "memory": memory,
+    "video": video,
 }
 
 

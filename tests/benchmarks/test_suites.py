@@ -11,7 +11,9 @@ from benchmarks.__main__ import main
 from benchmarks.measurement import Report, by_turns
 
 
-@pytest.mark.parametrize("suite", ["render", "stream", "http", "estimate", "startup", "scale", "replicas", "memory"])
+@pytest.mark.parametrize(
+    "suite", ["render", "stream", "http", "estimate", "startup", "scale", "replicas", "memory", "video"]
+)
 def test_every_suite_runs_and_says_what_it_compared(
     suite: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
