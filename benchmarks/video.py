@@ -1,4 +1,4 @@
-"""`unbend video` beside ffmpeg's remap filter, on one file, with one map and one encoder; and what a minute of it keeps."""
+"""`unbend video` beside ffmpeg's remap filter: one file, one map, one encoder; and what a minute of video keeps."""
 
 from __future__ import annotations
 
