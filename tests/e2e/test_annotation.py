@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.e2e.axe import violations
 from tests.e2e.conftest import ROOT, shoot
 from training.annotations import read_annotation, read_annotations
 
@@ -79,6 +80,7 @@ def test_five_pictures_are_annotated_and_training_reads_them(annotating: Annotat
         page.wait_for_selector(f"#done-text:text-is('{done + 1} of 5 done')")
         if done == 0:
             shoot(page, "annotate-1440-light")
+            assert violations(page) == []
         page.keyboard.press("n")
     opened(page, names[3])
 
@@ -91,6 +93,7 @@ def test_five_pictures_are_annotated_and_training_reads_them(annotating: Annotat
     lay_curves(page)
     page.wait_for_selector("#done-text:text-is('5 of 5 done')")
     shoot(page, "annotate-768-dark")
+    assert violations(page) == []
 
     annotations = list(read_annotations(annotating.folder))
     assert [one.picture.name for one in annotations] == names
