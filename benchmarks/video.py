@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Report:
     """Whole commands, their start among it: reading, decoding, remapping, encoding, writing, sound copied."""
     report = Report("video")
-    runs, minute_s, turn_s = (2, 5, 1) if arguments.quick else (arguments.runs, arguments.minute_s, arguments.turn_s)
+    runs, minute_s, turn_s = (2, 2, 0.2) if arguments.quick else (arguments.runs, arguments.minute_s, arguments.turn_s)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         grid = barrel_grid()
@@ -76,18 +76,19 @@ def _minute(report: Report, folder: Path, seconds: int) -> None:
 
 
 def _turns(
-    report: Report, folder: Path, seconds: int, runs: int, graph: str, maps: str, peer_name: str, bar: float
+    report: Report, folder: Path, seconds: float, runs: int, graph: str, maps: str, peer_name: str, bar: float
 ) -> None:
     source, ours, peer = folder / f"{seconds}.mp4", folder / "ours.mp4", folder / "peer.mp4"
     _film(source, seconds)
+    frames = round(seconds * FPS)
     theirs = ["ffmpeg", "-v", "error", "-y", "-i", str(source), "-i", f"{maps}xmap.pgm", "-i", f"{maps}ymap.pgm"]
     theirs += ["-filter_complex", graph, "-map", "[straight]", "-map", "0:a", *ENCODER, "-c:a", "copy", str(peer)]
     pair = by_turns(
         lambda: _run(_ours(folder, source, ours), folder), lambda: _run(theirs, folder), runs, warm_up=0
-    ).per(seconds * FPS)
+    ).per(frames)
     counted = _probe(ours)["frames"], _probe(peer)["frames"]
-    if counted != (seconds * FPS, seconds * FPS):
-        raise RuntimeError(f"{counted} of {seconds * FPS} frames were written by us and by ffmpeg")
+    if counted != (frames, frames):
+        raise RuntimeError(f"{counted} of {frames} frames were written by us and by ffmpeg")
     name = f"unbend video, {seconds} s of 1080p{FPS} h264 / ffmpeg remap filter, {peer_name}"
     report.add_pair(
         name,
@@ -99,7 +100,7 @@ def _turns(
     report.add_ratio(f"unbend video / ffmpeg remap filter, {peer_name}, frames/s", 1 / pair.ratio, at_least=bar)
 
 
-def _film(path: Path, seconds: int) -> None:
+def _film(path: Path, seconds: float) -> None:
     """h264 and AAC: a window that wanders over a photograph."""
     window = f"crop={WIDTH}:{HEIGHT}:(iw-ow)*(0.5+0.5*sin(t)):(ih-oh)*(0.5+0.5*cos(t/2))"
     command = ["ffmpeg", "-v", "error", "-y", "-loop", "1", "-framerate", str(FPS), "-i", str(PHOTOGRAPH)]
