@@ -12,7 +12,7 @@ RUN apt-get update \
  && rm -rf /var/lib/apt/lists/*
 RUN python3 -m venv /opt/unbend
 WORKDIR /src
-ARG EXTRAS="service redis otel"
+ARG EXTRAS="service redis export lensfun otel"
 # The dependencies make a layer of their own, because they change less often than the code.
 COPY pyproject.toml constraints.txt ./
 COPY deploy/image/requirements.py deploy/image/
