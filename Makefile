@@ -158,3 +158,20 @@ fuzz: setup-dev  ## Send FUZZ_N (100,000) malformed inputs over both transports 
 	$(BIN)/python -m tests.fuzz
 
 .PHONY: fuzz
+
+$(VENV)/.supply: pyproject.toml $(CONSTRAINTS) $(VENV)/.dev
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS) --group supply
+	@touch $@
+
+lock: setup-dev  ## Write requirements.lock: versions and hashes of all that the service needs
+	$(BIN)/python deploy/lock.py
+
+audit: $(VENV)/.supply  ## Ask for known vulnerabilities of requirements.lock (AUDIT="-s osv"); not asked is not passed
+	$(BIN)/python deploy/audit.py $(AUDIT)
+
+sbom: $(VENV)/.supply  ## Write artifacts/sbom.cdx.json (CycloneDX) of what requirements.lock names
+	mkdir -p artifacts
+	$(BIN)/cyclonedx-py requirements requirements.lock --pyproject pyproject.toml --output-reproducible \
+	  --of JSON -o artifacts/sbom.cdx.json
+
+.PHONY: lock audit sbom
