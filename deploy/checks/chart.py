@@ -32,7 +32,8 @@ def value_sets() -> list[str]:
 
 def values_of(name: str) -> dict[str, Any]:
     """One set of values, as Helm reads it."""
-    return helm_python.values_from_yaml((VALUES / f"{name}.yaml").read_text())
+    values: dict[str, Any] = helm_python.values_from_yaml((VALUES / f"{name}.yaml").read_text())
+    return values
 
 
 def render(values: dict[str, Any]) -> list[Manifest]:
