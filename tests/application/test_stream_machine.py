@@ -101,7 +101,8 @@ class StreamMachine(RuleBasedStateMachine):
             self._step(self._ended(older))
             assert isinstance(older.error, StreamTakenOver)
             assert older.error.resume is not None
-            assert older.error.resume.last_index == (older.answers[-1].index if older.answers else None)
+            # The answer that was just being handed over may count as not taken: better sent again than lost.
+            assert older.error.resume.last_index in [None, *(answer.index for answer in older.answers)][-2:]
 
     @rule(wrong=st.sampled_from(["size", "id", "frames", "format"]))
     def open_wrongly(self, wrong: str) -> None:
