@@ -45,6 +45,7 @@ EXTRAS = {
     "video": Extra("av", "av", "unbend video, PyAV frames in the client"),
     "export": Extra("openexr", "OpenEXR", "STMaps as EXR"),
     "lensfun": Extra("lensfunpy", "lensfunpy", "grids from lensfun profiles"),
+    "otel": Extra("opentelemetry-sdk", "opentelemetry.sdk", "traces"),
 }
 
 
