@@ -5,9 +5,11 @@ from __future__ import annotations
 import asyncio
 import doctest
 import importlib
+import sys
 
 import numpy as np
 import pytest
+import structlog
 
 import unbend
 from tests.client.conftest import Server
@@ -19,6 +21,8 @@ PLAIN = {"FrameStatus", "Outcome"}
 
 @pytest.mark.parametrize("name", MODULES)
 def test_examples_do_what_they_say(server: Server, name: str) -> None:
+    # The service logs its calls in this very process, and examples are held to all that is printed.
+    structlog.configure(logger_factory=structlog.PrintLoggerFactory(sys.stderr))
     runner = doctest.DocTestRunner(verbose=False)
     module = importlib.import_module(name)
     with unbend.Client(server.target) as client:
