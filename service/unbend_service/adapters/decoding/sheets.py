@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 
@@ -13,6 +14,8 @@ from unbend_service.application.ports import Bytes
 from unbend_service.domain.errors import MemoryFull, Unavailable
 
 _RETRY_AFTER_S = 1.0
+#: Nothing was decoded for as long: what is kept warm is given back.
+_REST_S = 10.0
 
 
 class _Loan:
@@ -33,9 +36,10 @@ class Sheets:
     Args:
         limit_bytes: of all that are in use; ``setting`` governs it.
         kept_bytes: of those that are kept for the next time.
+        rest_s: after which without a picture none is kept.
     """
 
-    def __init__(self, limit_bytes: int, kept_bytes: int, setting: str) -> None:
+    def __init__(self, limit_bytes: int, kept_bytes: int, setting: str, rest_s: float = _REST_S) -> None:
         self._limit_bytes = limit_bytes
         self._kept_bytes = kept_bytes
         self._setting = setting
@@ -45,6 +49,9 @@ class Sheets:
         self._returned: deque[Slot] = deque()
         self._made = 0
         self._closed = False
+        self._rest_s = rest_s
+        self._resting: threading.Timer | None = None
+        self._asked_s = 0.0
         self.used_bytes = 0
 
     def acquire(self, size_bytes: int) -> Slot:
@@ -56,6 +63,9 @@ class Sheets:
         """
         wanted = slot_class_bytes(size_bytes)
         with self._lock:
+            self._asked_s = time.monotonic()
+            if self._resting is None:
+                self._look_later(self._rest_s)
             self._take_back()
             if self.used_bytes + wanted > self._limit_bytes:
                 raise MemoryFull(
@@ -95,7 +105,30 @@ class Sheets:
         """Frees what nobody looks at now, and what is looked at later."""
         with self._lock:
             self._closed = True
+            if self._resting is not None:
+                self._resting.cancel()
             self._take_back()
+
+    def _look_later(self, pause_s: float) -> None:
+        # begun where a sheet is asked for: where a loan ends no thread may be started
+        if not self._closed:
+            self._resting = threading.Timer(pause_s, self._rest)
+            self._resting.daemon = True
+            self._resting.start()
+
+    def _rest(self) -> None:
+        """Gives back what is kept, unless something was asked for lately; looks again while something is in use."""
+        with self._lock:
+            self._resting = None
+            self._take_back()
+            left_s = self._asked_s + self._rest_s - time.monotonic()
+            if left_s > 0:
+                self._look_later(left_s)
+                return
+            while self._free:
+                self._free.popleft().close()
+            if self.used_bytes:
+                self._look_later(self._rest_s)
 
     def _take_back(self) -> None:
         while self._returned:
