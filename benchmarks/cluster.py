@@ -11,7 +11,6 @@ import sys
 import tempfile
 import threading
 import time
-import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,6 +19,7 @@ import psutil
 
 from benchmarks.companions import Companion, free_port, redis_server
 from benchmarks.proxies import PROXIES, Proxy
+from benchmarks.serving import scraped
 
 _START_S = 120.0
 
@@ -70,14 +70,7 @@ class Replica:
 
     def metric(self, name: str, **labels: str) -> float:
         """Sum of the samples of one metric whose labels contain ``labels``."""
-        with urllib.request.urlopen(f"http://127.0.0.1:{self.http_port}/metrics", timeout=30) as answer:
-            lines = answer.read().decode().splitlines()
-        total = 0.0
-        for line in lines:
-            head, _, value = line.rpartition(" ")
-            if head.split("{")[0] == name and all(f'{key}="{text}"' in head for key, text in labels.items()):
-                total += float(value)
-        return total
+        return scraped(f"127.0.0.1:{self.http_port}", name, **labels)
 
     def kill(self) -> None:
         """Ends it and its workers as a failure of the machine would."""

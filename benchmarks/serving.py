@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -27,6 +28,18 @@ class Served:
     grpc: str
     ready_s: float
     pid: int
+
+
+def scraped(http: str, name: str, **labels: str) -> float:
+    """Sum of the samples of one metric of the service at ``http``, host:port, whose labels contain ``labels``."""
+    with urllib.request.urlopen(f"http://{http}/metrics", timeout=30) as answer:
+        lines = answer.read().decode().splitlines()
+    total = 0.0
+    for line in lines:
+        head, _, value = line.rpartition(" ")
+        if head.split("{")[0] == name and all(f'{key}="{text}"' in head for key, text in labels.items()):
+            total += float(value)
+    return total
 
 
 @contextmanager

@@ -20,6 +20,7 @@ from training.picture_network import PictureBranch
 from unbend_service.adapters.estimators.views import VIEW_PX
 
 # mypy: disallow-subclassing-any=False
+# (types are also checked where torch is not installed, and its modules are Any)
 
 
 class _Answer(nn.Module):

@@ -14,6 +14,8 @@ from dataclasses import dataclass, field
 import psutil
 import pytest
 
+from benchmarks.serving import scraped
+
 
 @dataclass
 class Server:
@@ -32,12 +34,7 @@ class Server:
 
     def metric(self, name: str, **labels: str) -> float:
         """Sum of the samples of one metric whose labels contain ``labels``."""
-        total = 0.0
-        for line in self.get("/metrics").decode().splitlines():
-            head, _, value = line.rpartition(" ")
-            if head.split("{")[0] == name and all(f'{key}="{text}"' in head for key, text in labels.items()):
-                total += float(value)
-        return total
+        return scraped(self.http, name, **labels)
 
     def get(self, path: str) -> bytes:
         with urllib.request.urlopen(f"http://{self.http}{path}", timeout=30) as answer:

@@ -13,7 +13,7 @@ from typing import Any
 
 import psutil
 
-from benchmarks.serving import Served
+from benchmarks.serving import Served, scraped
 
 
 @dataclass(frozen=True)
@@ -50,14 +50,7 @@ class Watched:
 
     def metric(self, name: str, **labels: str) -> float:
         """Sum of the samples of one metric whose labels contain ``labels``."""
-        with urllib.request.urlopen(f"http://{self.served.http}/metrics", timeout=10) as answer:
-            lines = answer.read().decode().splitlines()
-        total = 0.0
-        for line in lines:
-            head, _, value = line.rpartition(" ")
-            if head.split("{")[0] == name and all(f'{key}="{text}"' in head for key, text in labels.items()):
-                total += float(value)
-        return total
+        return scraped(self.served.http, name, **labels)
 
     def descriptors(self) -> int:
         return self.process.num_fds()

@@ -134,7 +134,8 @@ class Inputs:
         sent = [opened, *frames]
         broken = self._rng.randrange(len(sent))
         sent[broken] = mutated(self._rng, sent[broken], self._rng.choice(messages))
-        self._rng.random() < 0.1 and self._rng.shuffle(sent)  # type: ignore[func-returns-value]
+        if self._rng.random() < 0.1:
+            self._rng.shuffle(sent)
         return GrpcCase(method, tuple(sent), streaming=True)
 
     def _broken_picture(self) -> bytes:

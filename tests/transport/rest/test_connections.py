@@ -183,9 +183,9 @@ async def test_an_answer_that_nobody_reads_is_given_up(port: int) -> None:
         with suppress(ConnectionError, TimeoutError):
             await asyncio.wait_for(writer.drain(), 1)
         transport = writer.transport
-        transport.pause_reading()  # type: ignore[attr-defined]
+        transport.pause_reading()  # type: ignore[attr-defined]  # a reading transport, typed as a writing one
         await asyncio.sleep(2)
-        transport.resume_reading()  # type: ignore[attr-defined]
+        transport.resume_reading()  # type: ignore[attr-defined]  # as above
 
         async def read_on() -> None:
             while True:

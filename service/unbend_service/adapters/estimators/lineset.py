@@ -71,12 +71,16 @@ class Evidence:
 
 
 class LinesetEstimator:
-    """Guides from the edge chains of a grey picture, through one set network.
+    """Guides from the edge chains of a grey picture, through a set network and what stands beside it.
 
     The picture is reduced, never enlarged and never squashed: chains live in the isotropic frame, so a lens keeps its
     shape whatever the aspect of the picture. The picture and its mirror image are looked at in one batch and averaged.
     With two ``looks`` the chains of a strong distortion are then straightened by the first estimate and looked at
     again, and both maps are composed: what the first look left of it is a weak one.
+
+    With a ``branch`` in the card a second network looks at the picture itself, and decides at the first look whom to
+    follow (`picture_branch`). At last a radial lens of a few numbers takes the place of the guides where the chains
+    speak for it (`radial`); it comes as eight guides a direction, whatever the network's number.
 
     Args:
         card: its ``parameters`` are ``nodes`` (degree + 1 positions along a guide) and ``anchors`` (K positions), both
@@ -120,7 +124,7 @@ class LinesetEstimator:
         return self._model
 
     def estimate(self, grey: Bytes) -> Estimate:
-        """Estimates the guides of one picture; thread-safe, blocking, about 20 ms on one core.
+        """Estimates the guides of one picture; thread-safe, blocking, about 50 ms on one core.
 
         Args:
             grey: (height, width) uint8, any size, upright.
