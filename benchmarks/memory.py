@@ -29,7 +29,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Report:
-    """The slope of the resident memory of parent and workers, in MiB a minute, over the time after warm-up."""
+    """The slope of the resident memory of parent and workers, in MiB a minute, over the time after warm-up.
+
+    What is shared (files, the frames' slots, which a setting bounds) does not count.
+    """
     report = Report("memory")
     minutes = 0.1 if arguments.quick else arguments.minutes
     resident: dict[int, list[tuple[float, float]]] = defaultdict(list)
@@ -42,7 +45,8 @@ def run(arguments: argparse.Namespace) -> Report:
         while time.monotonic() < end:
             time.sleep(min(2.0, 6 * minutes))
             for process in (parent, *parent.children(recursive=True)):
-                resident[process.pid].append((time.monotonic(), process.memory_info().rss / 2**20))
+                memory = process.memory_info()
+                resident[process.pid].append((time.monotonic(), (memory.rss - memory.shared) / 2**20))
         for load in loads:
             load.join()
     for pid, points in resident.items():

@@ -1,9 +1,13 @@
 from __future__ import annotations
 
+import asyncio
 import subprocess
 import sys
 
 import pytest
+
+from unbend_service import allocator
+from unbend_service.allocator import heap, tended
 
 #: Resident MiB of threads' own arenas: each of 32 threads frees what it had, but for a crumb at the end of it.
 PROGRAM = """
@@ -43,3 +47,59 @@ def test_threads_share_two_arenas(tmp_path: object) -> None:
         return int(subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout)
 
     assert arenas("shared") <= 2 < arenas("own")
+
+
+#: MB that are resident before and after, of 100 MB all of which but the last crumb are free.
+GIVING_BACK = """
+from unbend_service.allocator import give_back
+def resident():
+    return int(open("/proc/self/statm").read().split()[1]) * 4096 // 10**6
+held = [bytearray(b"x" * 50_000) for _ in range(2000)]
+del held[:-1]
+before = resident()
+give_back()
+print(before, resident())
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="speaks of glibc")
+def test_what_is_free_goes_back_to_the_system() -> None:
+    """A block that stays does not keep what was freed below it."""
+    command = [sys.executable, "-c", GIVING_BACK]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+    before, after = map(int, done.stdout.split())
+    assert before - after > 80
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="speaks of glibc")
+def test_what_is_handed_out_and_what_is_kept_free_are_told_apart() -> None:
+    """Whoever looks for a leak sees whether memory is in use."""
+    before = heap()
+    held = bytearray(64 << 20)
+    during = heap()
+    del held
+    after = heap()
+    assert before is not None
+    assert during is not None
+    assert after is not None
+    assert during.used_bytes - before.used_bytes > 60 << 20
+    assert after.used_bytes - before.used_bytes < 8 << 20
+
+
+async def test_memory_is_given_back_at_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """While calls are under way it is left alone, for a while; soon after the last it is given back."""
+    given = asyncio.Event()
+    active = 1
+    monkeypatch.setattr(allocator, "REST_S", 0.01)
+    loop = asyncio.get_running_loop()
+    monkeypatch.setattr(allocator, "give_back", lambda: loop.call_soon_threadsafe(given.set))
+    with tended(lambda: active):
+        await asyncio.sleep(0.1)
+        assert not given.is_set()
+        active = 0
+        await asyncio.wait_for(given.wait(), 10)
+        active = 1
+        await asyncio.sleep(0.05)
+        given.clear()
+        monkeypatch.setattr(allocator, "_BUSY_S", 0.0)
+        await asyncio.wait_for(given.wait(), 10)

@@ -2,11 +2,52 @@
 
 from __future__ import annotations
 
+import asyncio
 import ctypes
 import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 
 _M_ARENA_MAX = -8
 _ARENAS = 2
+#: Nothing was to be done for so long: what is free goes back to the system.
+REST_S = 5.0
+#: Under load it goes back only so often: it takes some milliseconds, in which others who allocate wait.
+_BUSY_S = 60.0
+
+
+class _MallInfo2(ctypes.Structure):
+    """``struct mallinfo2`` of glibc 2.33, over all arenas."""
+
+    _fields_ = tuple(
+        (name, ctypes.c_size_t)
+        for name in (
+            "arena",
+            "ordblks",
+            "smblks",
+            "hblks",
+            "hblkhd",
+            "usmblks",
+            "fsmblks",
+            "uordblks",
+            "fordblks",
+            "keepcost",
+        )
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Heap:
+    """What malloc holds; Python's own small objects lie elsewhere.
+
+    Attributes:
+        used_bytes: handed out, large blocks that are mapped by themselves included.
+        free_bytes: kept for the next who asks; part of it may have been given back, address by address.
+    """
+
+    used_bytes: int
+    free_bytes: int
 
 
 def share_arenas() -> None:
@@ -18,6 +59,50 @@ def share_arenas() -> None:
     """
     if "MALLOC_ARENA_MAX" in os.environ:
         return
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    mallopt = _function("mallopt")
     if mallopt is not None:
         mallopt(_M_ARENA_MAX, _ARENAS)
+
+
+def heap() -> Heap | None:
+    """What malloc holds in this process; None where the C library does not say."""
+    mallinfo = _function("mallinfo2")
+    if mallinfo is None:
+        return None
+    mallinfo.restype = _MallInfo2
+    info = mallinfo()
+    return Heap(info.uordblks + info.hblkhd, info.fordblks)
+
+
+def give_back() -> None:
+    """Gives free memory back to the system, that between blocks in use included; elsewhere nothing happens.
+
+    By itself glibc gives back only what lies at the very end, so that one small block which stays keeps all below it.
+    """
+    trim = _function("malloc_trim")
+    if trim is not None:
+        trim(0)
+
+
+@contextmanager
+def tended(active: Callable[[], int]) -> Iterator[None]:
+    """Gives free memory back now and then: when ``active()`` calls are none, or else once a minute."""
+    task = asyncio.create_task(_tend(active))
+    try:
+        yield
+    finally:
+        task.cancel()
+
+
+async def _tend(active: Callable[[], int]) -> None:
+    clock = asyncio.get_running_loop().time
+    given_s = clock()
+    while True:
+        await asyncio.sleep(REST_S)
+        if not active() or clock() - given_s >= _BUSY_S:
+            given_s = clock()
+            await asyncio.to_thread(give_back)
+
+
+def _function(name: str) -> ctypes._NamedFuncPointer | None:
+    return getattr(ctypes.CDLL(None), name, None)

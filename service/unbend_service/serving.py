@@ -18,7 +18,7 @@ import structlog
 import uvicorn
 from fastapi import FastAPI
 
-from unbend_service.allocator import share_arenas
+from unbend_service.allocator import share_arenas, tended
 from unbend_service.application.service import Service
 from unbend_service.exposure import check_exposure
 from unbend_service.refreshing import refreshed
@@ -130,7 +130,7 @@ async def _serve(
         if on_ready is not None:
             on_ready(addresses)
         ends: set[asyncio.Future[Any]] = {serving, stop}
-        with refreshed(service.access, certificates):
+        with refreshed(service.access, certificates), tended(lambda: service.admission.active):
             await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
             notice_s = settings.drain_notice_s if stop.done() and stop.result() == signal.SIGTERM else 0.0
             _end_at_last(notice_s + settings.drain_s + _LAST_WORDS_S)

@@ -5,17 +5,17 @@ from __future__ import annotations
 import http.client
 import threading
 import time
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from random import Random
 
 import grpc
-import numpy as np
 
 import unbend
 from benchmarks.material import barrel_grid, frames, jpeg, photograph
 from benchmarks.serving import served
+from tests.endurance.holding import Holdings
 from tests.endurance.verdict import Verdict
 from tests.endurance.watching import Watched, wait_for
 from unbend.v1 import correction_pb2, correction_pb2_grpc, frame_pb2
@@ -23,41 +23,41 @@ from unbend_service.domain.frames import PixelFormat
 
 LOADS = 4
 CANCELLED_SHARE = 0.1
-SLOPE_BAR_MB_PER_HOUR = 1.0
-#: A slope is a figure only after a while; before, resident memory may just not have grown by more than this.
-LONG_RUN_S, SHORT_GROWTH_MB = 1800.0, 32.0
-SAMPLE_S = 2.0
+#: Work between two looks at what is held at rest, and how long memory takes to be given back.
+SPELL_S, _REST_S = 150.0, 12.0
 WIDTH, HEIGHT = 640, 360
 
 
 def run(seconds: float, renderer: str) -> Verdict:
-    """Works for ``seconds``, waits until the service has come to rest, and compares with how it was."""
+    """Works for ``seconds``, lets the service come to rest now and then, and compares with how it was at first."""
     verdict = Verdict("soak")
+    done: Counter[str] = Counter()
+    failures: list[str] = []
     with served(renderer=renderer, workers=2, known_images=64, grid_store_entries=256) as service:
         watched = Watched(service)
         wait_for(lambda: watched.workers_ready() == 2, 30)
         _work(service.http, service.grpc, min(20.0, seconds / 4))  # caches, threads and pools come to be
-        wait_for(lambda: _at_rest(watched), 30)
-        rest = watched.descriptors(), watched.shared_bytes()
-        resident: dict[str, list[tuple[float, float]]] = defaultdict(list)
-        halt = threading.Event()
-        watching = threading.Thread(target=_watch, args=(watched, resident, halt))
-        watching.start()
-        done, failures = _work(service.http, service.grpc, seconds)
-        halt.set()
-        watching.join()
-        wait_for(lambda: _at_rest(watched) and watched.descriptors() <= rest[0], 30)
+        _rest(watched)
+        before = watched.descriptors(), watched.shared_bytes()
+        holdings = Holdings(watched)
+        holdings.look()
+        end_s = time.monotonic() + seconds
+        while (left_s := end_s - time.monotonic()) > _REST_S:
+            worked, failed = _work(service.http, service.grpc, min(SPELL_S, left_s))
+            done += worked
+            failures += failed
+            _rest(watched, before[0])
+            holdings.look()
         cancelled = sum(count for name, count in done.items() if name.endswith("given up"))
         total = sum(done.values())
         verdict.say(f"{seconds:g} s, {total} calls and streams, {cancelled / max(1, total):.1%} of them given up")
         for failure in failures[:20]:
             print("  ", failure)
         verdict.say(f"{len(failures)} failed", not failures)
-        for name, points in sorted(resident.items()):
-            _judge_memory(verdict, name, np.array(points), seconds)
+        holdings.judge(verdict, seconds)
         descriptors, shared = watched.descriptors(), watched.shared_bytes()
-        verdict.say(f"descriptors {rest[0]} before, {descriptors} after", descriptors <= rest[0])
-        verdict.say(f"shared memory {rest[1] >> 20} MiB before, {shared >> 20} MiB after", shared <= rest[1])
+        verdict.say(f"descriptors {before[0]} before, {descriptors} after", descriptors <= before[0])
+        verdict.say(f"shared memory {before[1] >> 20} MiB before, {shared >> 20} MiB after", shared <= before[1])
         readiness = watched.readiness()
         verdict.say(
             f"{readiness['streams']} streams, {readiness['active']} calls, {readiness['queued']} frames open",
@@ -68,35 +68,16 @@ def run(seconds: float, renderer: str) -> Verdict:
     return verdict
 
 
+def _rest(watched: Watched, descriptors: int | None = None) -> None:
+    """Waits until nothing is under way, and what is kept for the next picture has been given back."""
+    rested_s = time.monotonic() + _REST_S
+    wait_for(lambda: _at_rest(watched) and (descriptors is None or watched.descriptors() <= descriptors), 30)
+    time.sleep(max(0.0, rested_s - time.monotonic()))
+
+
 def _at_rest(watched: Watched) -> bool:
     readiness = watched.readiness()
     return bool(readiness["streams"] == readiness["active"] == readiness["queued"] == watched.shared_bytes() == 0)
-
-
-def _watch(watched: Watched, resident: dict[str, list[tuple[float, float]]], halt: threading.Event) -> None:
-    names = {worker.pid: f"worker {n}" for n, worker in enumerate(watched.workers())}
-    processes = {"parent": watched.process, **{names[worker.pid]: worker for worker in watched.workers()}}
-    while not halt.wait(SAMPLE_S):
-        for name, process in processes.items():
-            memory = process.memory_info()
-            resident[name].append((time.monotonic(), (memory.rss - memory.shared) / 1e6))
-
-
-def _judge_memory(verdict: Verdict, name: str, points: np.ndarray, seconds: float) -> None:
-    """The slope after the first third, which is warm-up; the frames' shared memory is counted by itself."""
-    kept = points[len(points) // 3 :]
-    if len(kept) < 3:
-        return
-    hours = (kept[:, 0] - kept[0, 0]) / 3600
-    slope, _ = np.polyfit(hours, kept[:, 1], 1)
-    parts = np.array_split(kept[:, 1], 3)
-    growth = float(np.median(parts[-1]) - np.median(parts[0]))
-    long = seconds >= LONG_RUN_S
-    bar = f"at most {SLOPE_BAR_MB_PER_HOUR:g} MB/h" if long else f"growth {growth:+.1f} of {SHORT_GROWTH_MB:g} MB"
-    verdict.say(
-        f"{name}: {kept[0, 1]:.0f} to {kept[-1, 1]:.0f} MB, {slope:+.1f} MB/h ({bar})",
-        slope <= SLOPE_BAR_MB_PER_HOUR if long else growth <= SHORT_GROWTH_MB,
-    )
 
 
 def _work(http: str, address: str, seconds: float) -> tuple[Counter[str], list[str]]:

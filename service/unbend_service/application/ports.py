@@ -102,6 +102,10 @@ class Renderer(Protocol):
         """
         ...
 
+    def rest(self) -> None:
+        """Nothing was drawn for a while: gives back what is kept for a next frame of the same size alone."""
+        ...
+
     def close(self) -> None: ...
 
 

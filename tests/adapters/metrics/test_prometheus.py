@@ -90,6 +90,19 @@ def test_every_name_is_prefixed() -> None:
     assert all(name.startswith("unbend_") for name, _ in samples(PrometheusMeter()))
 
 
+def test_memory_in_use_is_told_from_memory_that_is_kept() -> None:
+    """A leak shows as what is in use; what only the allocator keeps does not."""
+    meter = PrometheusMeter()
+    before = value(meter, "unbend_memory_bytes", state="used")
+    held = bytearray(64 << 20)
+    after = value(meter, "unbend_memory_bytes", state="used")
+    assert before is not None
+    assert after is not None
+    assert after - before > 0.9 * len(held)
+    assert (value(meter, "unbend_memory_bytes", state="free") or 0) > 0
+    assert (value(meter, "unbend_python_blocks") or 0) > 10_000
+
+
 def test_nothing_is_said_twice() -> None:
     """Creation times, which double a scrape, are left out."""
     meter = PrometheusMeter()

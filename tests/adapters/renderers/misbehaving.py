@@ -49,6 +49,9 @@ class MisbehavingRenderer:
             time.sleep(0.02)
             target[:4] = list(os.getpid().to_bytes(4))
 
+    def rest(self) -> None:
+        self._renderer.rest()
+
     def close(self) -> None:
         self._renderer.close()
 

@@ -29,6 +29,9 @@ class FakeEgl:
     def info(self) -> RendererInfo:
         return RendererInfo("egl", "NVIDIA H100" if self.hardware else "llvmpipe", self.hardware)
 
+    def rest(self) -> None:
+        pass
+
     def close(self) -> None:
         self.closed += 1
 

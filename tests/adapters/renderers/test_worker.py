@@ -7,12 +7,18 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 
 import numpy as np
 import psutil
+import pytest
 
 from tests.adapters.renderers import misbehaving
 from tests.adapters.renderers.conftest import MakePool, until
+from unbend_service.adapters.renderers import worker as worker_module
+from unbend_service.adapters.renderers.channel import Channel
+from unbend_service.adapters.renderers.cpu import CpuRenderer
+from unbend_service.adapters.renderers.worker import Worker
 from unbend_service.domain.frames import BLACK, Frame, PixelFormat
 from unbend_service.domain.grid import Grid
 
@@ -85,3 +91,29 @@ async def test_descriptors_do_not_pile_up(make_pool: MakePool) -> None:
     assert psutil.Process().num_fds() < 100
     mapped = sum("unbend-slot" in entry.path for entry in worker.memory_maps())
     assert 0 < mapped < 30
+
+
+def test_a_worker_without_work_gives_memory_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is kept only for a next frame of the same size is not kept for hours."""
+    renderer, rested = CpuRenderer(), threading.Event()
+    rgb = Frame(PixelFormat.RGB24, 640, 480, np.zeros(640 * 480 * 3, np.uint8))
+    renderer.render(rgb, Grid.identity(), BLACK, np.empty_like(rgb.data))
+    kept_bytes = renderer.kept_bytes
+    assert renderer._wide is not None
+    monkeypatch.setattr(worker_module, "REST_S", 0.01)
+    monkeypatch.setattr(worker_module, "give_back", rested.set)
+    ours, theirs = Channel.pair()
+
+    def serve() -> None:
+        with pytest.raises(EOFError):
+            Worker(theirs, renderer).serve()
+
+    serving = threading.Thread(target=serve)
+    serving.start()
+    assert rested.wait(10)
+    ours.close()
+    serving.join(10)
+    assert not serving.is_alive()
+    assert renderer._wide is None
+    assert renderer.kept_bytes == kept_bytes > 0
+    theirs.close()

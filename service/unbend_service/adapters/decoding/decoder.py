@@ -21,6 +21,7 @@ import numpy as np
 
 from unbend_service.adapters.codecs.pillow import PillowCodec
 from unbend_service.adapters.decoding.wire import Wire
+from unbend_service.allocator import REST_S, give_back
 from unbend_service.application.ports import Bytes
 from unbend_service.domain.cameras import Camera
 from unbend_service.domain.dense_maps import PixelMap
@@ -56,7 +57,7 @@ class Decoder:
         """Works until it ran out of memory; raises EOFError or OSError when the parent goes."""
         exhausted = False
         while not exhausted:
-            request, fd = self._wire.receive()
+            request, fd = self._next()
             if fd is None:
                 raise EOFError
             try:
@@ -74,6 +75,14 @@ class Decoder:
                 answer = _failure(InvalidImage(f"The file cannot be read: {type(error).__name__}."))
             answer["last"] = exhausted
             self._wire.send(answer)
+
+    def _next(self) -> tuple[Answer, int | None]:
+        """The next request; if it is long in coming, memory is given back meanwhile."""
+        try:
+            return self._wire.receive(REST_S)
+        except TimeoutError:
+            give_back()
+            return self._wire.receive()
 
     def _probe(self, body: bytes, request: Answer) -> Answer:
         header = self._codec.probe(body)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections import Counter as Tally
 from collections.abc import Iterable
 
@@ -9,6 +10,7 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 from prometheus_client.metrics_core import Metric
 
+from unbend_service.allocator import Heap, heap
 from unbend_service.application.ports import ModelInfo, PoolState
 
 STAGES = ("queue", "decode", "estimate", "grid", "render", "encode")
@@ -74,6 +76,20 @@ class PrometheusMeter:
         self._store_outages = Counter(
             "unbend_grid_store_outages", "Times that the shared grid store stopped answering.", registry=registry
         )
+        memory = Gauge(
+            "unbend_memory_bytes",
+            "What malloc of the parent process has handed out (used), and keeps for the next who asks (free).",
+            ["state"],
+            registry=registry,
+        )
+        blocks = Gauge(
+            "unbend_python_blocks",
+            "Blocks that Python has handed out in the parent process.",
+            registry=registry,
+        )
+        memory.labels("used").set_function(lambda: _heap().used_bytes)
+        memory.labels("free").set_function(lambda: _heap().free_bytes)
+        blocks.set_function(sys.getallocatedblocks)
         self._renderer = Info("unbend_renderer", "Which renderer the workers run.", registry=registry)
         self._model = Info("unbend_model", "Which network estimates.", registry=registry)
         for stage in STAGES:
@@ -142,6 +158,10 @@ class PrometheusMeter:
     def render(self) -> tuple[bytes, str]:
         """Everything counted so far, in the Prometheus text format, and its content type."""
         return generate_latest(_WithoutBirthdays(self._registry)), CONTENT_TYPE_LATEST
+
+
+def _heap() -> Heap:
+    return heap() or Heap(0, 0)
 
 
 class _WithoutBirthdays(CollectorRegistry):

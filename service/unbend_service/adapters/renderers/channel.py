@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import select
 import socket
 from dataclasses import dataclass
 
@@ -153,6 +154,12 @@ class Channel:
             raise EOFError
         message: ToWorker | FromWorker = pickle.loads(body)
         return message, fds[0] if fds else None
+
+    def wait(self, patience_s: float) -> bool:
+        """Whether a message, or the end, is there within ``patience_s``."""
+        poll = select.poll()
+        poll.register(self._socket, select.POLLIN)
+        return bool(poll.poll(1000 * patience_s))
 
     def close(self) -> None:
         self._socket.close()

@@ -126,9 +126,13 @@ class CpuRenderer:
         _draw(wide, strips, (*colour, 255), wide_drawn)
         cv2.cvtColor(wide_drawn, cv2.COLOR_RGBA2RGB, dst=drawn)
 
+    def rest(self) -> None:
+        """See :class:`~unbend_service.application.ports.Renderer`; the maps stay."""
+        self._wide = None
+
     def close(self) -> None:
         self._maps.clear()
-        self._wide = None
+        self.rest()
 
 
 def _draw(samples: Bytes, strips: Iterable[_Strip], colour: tuple[int, ...], drawn: Bytes) -> None:

@@ -299,6 +299,9 @@ class EglRenderer:
         ]
         return self._meshes.put(grid.id, _Mesh(vertices, triangles, *arrays), points.nbytes + corners.nbytes)
 
+    def rest(self) -> None:
+        """See :class:`~unbend_service.application.ports.Renderer`; what is kept here is bounded by itself."""
+
     def close(self) -> None:
         if self._closed:
             return

@@ -20,13 +20,16 @@ from unbend_service.adapters.renderers.channel import (
     Channel,
     Done,
     Failed,
+    FromWorker,
     MapSlot,
     Place,
     Ready,
     Task,
+    ToWorker,
     UnmapSlots,
 )
 from unbend_service.adapters.renderers.slots import Slot
+from unbend_service.allocator import REST_S, give_back
 from unbend_service.application.ports import Bytes, Renderer
 from unbend_service.domain.errors import InvalidInput, RendererUnavailable, RenderFailed, UnbendError
 from unbend_service.domain.frames import Frame, frame_size_bytes
@@ -56,7 +59,7 @@ class Worker:
             EOFError, ConnectionError: the parent has gone.
         """
         while self._failures < _FAILURES_IN_A_ROW:
-            message, fd = self._channel.receive()
+            message, fd = self._next()
             if isinstance(message, MapSlot) and fd is not None:
                 self._slots[message.slot] = Slot(message.slot, fd, message.size_bytes)
             elif isinstance(message, UnmapSlots):
@@ -64,6 +67,13 @@ class Worker:
                     self._slots.pop(number).close()
             elif isinstance(message, Task):
                 self._channel.send(self._answer(message))
+
+    def _next(self) -> tuple[FromWorker | ToWorker, int | None]:
+        """The next message; if it is long in coming, memory is given back meanwhile."""
+        if not self._channel.wait(REST_S):
+            self._renderer.rest()
+            give_back()
+        return self._channel.receive()
 
     def _answer(self, task: Task) -> Done | Failed:
         started = time.perf_counter()
