@@ -50,6 +50,8 @@ class Holdings:
             self.resident[name].append((now_s, (memory.rss - memory.shared) / 1e6))
         self.used.append((now_s, self.watched.metric("unbend_memory_bytes", state="used") / 1e6))
         self.blocks.append((now_s, self.watched.metric("unbend_python_blocks") * _BLOCK_BYTES / 1e6))
+        held = ", ".join(f"{name} {points[-1][1]:.1f}" for name, points in self.resident.items())
+        print(f"   at {now_s - self.used[0][0]:.0f} s: {held}; malloc {self.used[-1][1]:.1f} MB", flush=True)
 
     def judge(self, verdict: Verdict, seconds: float) -> None:
         """The slopes after the first third, which is warm-up.
