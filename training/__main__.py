@@ -1,4 +1,4 @@
-"""`python -m training VERB`: store, train, cooldown, branch, branch-cooldown, calibrate, export, evaluate, plot."""
+"""`python -m training VERB`: chains and scenes, runs, calibration, export, measures (training/README.md)."""
 
 from __future__ import annotations
 
@@ -58,6 +58,12 @@ def _parser() -> argparse.ArgumentParser:
     store.add_argument("--free-only", action="store_true", help="drawn scenes and CC0 photographs only")
     store.set_defaults(verb=_store)
 
+    scenes = verbs.add_parser("scenes", help="write drawn scenes as PNG, for `unbend eval --scenes`")
+    scenes.add_argument("folder", type=Path)
+    scenes.add_argument("--count", type=int, default=100)
+    scenes.add_argument("--seed", type=int, default=99, help="1 and 7 are those of the training runs")
+    scenes.set_defaults(verb=_scenes)
+
     train = verbs.add_parser("train", help="start the long run, or go on with it")
     train.add_argument("--name", default="run")
     train.add_argument("--minutes", type=float)
@@ -112,6 +118,16 @@ def _store(arguments: argparse.Namespace) -> None:
     store = build_store(pictures)
     store.save(arguments.directory / "chains.npz")
     print(f"{store.pictures} pictures, {len(store.x)} points -> {arguments.directory / 'chains.npz'}")
+
+
+def _scenes(arguments: argparse.Namespace) -> None:
+    import cv2
+
+    from training.chain_store import drawn_scenes
+
+    arguments.folder.mkdir(parents=True, exist_ok=True)
+    for number, (_, grey) in enumerate(drawn_scenes(arguments.count, arguments.seed)):
+        cv2.imwrite(str(arguments.folder / f"{number:04}.png"), grey)
 
 
 def _train(arguments: argparse.Namespace) -> None:

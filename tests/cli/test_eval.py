@@ -28,7 +28,9 @@ def test_a_model_is_measured(tmp_path: Path) -> None:
     command = ["eval", "--photos", str(tmp_path / "photos"), "--model", "lineset", "--per-camera", "1"]
     command += [
         "--suite",
-        "synthetic,no-harm,real-lenses",
+        "synthetic,no-harm,real-lenses,drawn-lenses",
+        "--scenes",
+        str(tmp_path / "photos"),
         "--families",
         "barrel,none",
         "--chessboards",
@@ -45,6 +47,7 @@ def test_a_model_is_measured(tmp_path: Path) -> None:
     bent = [m for m in results["measurements"]["synthetic"]["lineset"] if m["group"] == "barrel"]
     assert summary["lens_barrel_px"] < 0.5 * sum(m["lens_nothing_px"] for m in bent) / len(bent)
     assert summary["real_lenses_removed"] > 0.3
+    assert summary["drawn_lenses_straight_px"] < 0.5
     assert {"report.md", "results.json", "reliability.svg", "threshold.svg"} <= {
         path.name for path in (tmp_path / "out").iterdir()
     }
@@ -55,3 +58,11 @@ def test_an_unknown_suite_is_named(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["eval", "--photos", str(tmp_path), "--suite", "speed"])
     assert result.exit_code == 3
     assert "real-lenses" in result.stderr
+
+
+def test_lenses_over_drawn_scenes_need_scenes(tmp_path: Path) -> None:
+    """They are no photographs, so they are named apart."""
+    drawn_street(tmp_path / "0.png", 0)
+    result = CliRunner().invoke(app, ["eval", "--photos", str(tmp_path), "--suite", "drawn-lenses"])
+    assert result.exit_code == 3
+    assert "--scenes" in result.stderr

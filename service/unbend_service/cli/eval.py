@@ -18,7 +18,7 @@ from unbend_service.evaluation.families import FAMILIES
 from unbend_service.evaluation.figures import Gallery
 from unbend_service.evaluation.methods import Method, model_method, peer_methods
 from unbend_service.evaluation.report import REPORT, Evaluation
-from unbend_service.evaluation.suites import OBLIQUE, SUITES, SYNTHETIC, run_suite
+from unbend_service.evaluation.suites import DRAWN_LENSES, OBLIQUE, SUITES, SYNTHETIC, run_suite
 
 _FACADES = "facades_spb"
 
@@ -26,12 +26,12 @@ _FACADES = "facades_spb"
 def evaluate(
     photos: Annotated[Path, typer.Option(help="Straight photographs; the validation split of an index.csv.")],
     model: Annotated[list[str] | None, typer.Option(help="Of a shipped model, or a path; may be repeated.")] = None,
-    suite: Annotated[str, typer.Option(help=f"Any of {', '.join(SUITES)}, separated by commas.")] = ",".join(SUITES),
+    suite: Annotated[str, typer.Option(help=f"Any of {', '.join(SUITES)}, {DRAWN_LENSES}.")] = ",".join(SUITES),
     families: Annotated[str, typer.Option(help="Of the synthetic suite.")] = ",".join(FAMILIES),
     limit: Annotated[int, typer.Option(min=1, help="Most photographs of a suite.")] = 150,
     per_camera: Annotated[int, typer.Option(min=1, help="Photographs for each of the real lenses.")] = 5,
     facades: Annotated[str, typer.Option(help="Source in index.csv of the oblique suite's photographs.")] = _FACADES,
-    scenes: Annotated[Path | None, typer.Option(help="More straight pictures for the oblique suite.")] = None,
+    scenes: Annotated[Path | None, typer.Option(help=f"Drawn scenes: more for oblique; {DRAWN_LENSES}.")] = None,
     chessboards: Annotated[Path, typer.Option(help="left01.jpg, right01.jpg ... of two real cameras.")] = OPENCV_DOC,
     show: Annotated[str, typer.Option(help="Sources whose photographs may appear in figures.")] = _FACADES,
     peers: Annotated[bool, typer.Option(help="Also measure doing nothing, peers, floors and the true map.")] = False,
@@ -43,8 +43,10 @@ def evaluate(
     with errors_reported():
         chosen = suite.split(",")
         for name in chosen:
-            if name not in SUITES:
-                raise InvalidOption(f"There is no suite {name!r}.", allowed=", ".join(SUITES))
+            if name not in (*SUITES, DRAWN_LENSES):
+                raise InvalidOption(f"There is no suite {name!r}.", allowed=", ".join((*SUITES, DRAWN_LENSES)))
+            if name == DRAWN_LENSES and scenes is None:
+                raise InvalidOption(f"The suite {name} needs --scenes.", allowed="a folder of pictures")
         estimators = [load_estimator(name, usable_cores()) for name in model or ["lineset"]]
         methods: list[Method] = [model_method(estimator) for estimator in estimators]
         if peers:

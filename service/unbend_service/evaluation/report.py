@@ -20,6 +20,7 @@ _TITLES = {
     suites.SYNTHETIC: "Six families, none and mixed",
     suites.NO_HARM: "Undistorted photographs",
     suites.REAL_LENSES: "Real lenses",
+    suites.DRAWN_LENSES: "The same lenses over drawn scenes",
     suites.OBLIQUE: "Oblique and upright views",
     suites.ONE_CAMERA: "Ten pictures of one camera",
     suites.TABLE_ONE: "The paper's first table",
@@ -65,7 +66,7 @@ class Evaluation:
         return "\n".join(parts)
 
     def _table(self, suite: str, method: str, measurements: list[Measurement]) -> str:
-        if suite == suites.REAL_LENSES:
+        if suite in (suites.REAL_LENSES, suites.DRAWN_LENSES):
             return tables.lens_table(measurements)
         if suite == suites.OBLIQUE:
             return tables.oblique_table(measurements)
@@ -121,16 +122,17 @@ class Evaluation:
 
 
 def _figures(suite: str, measurements: list[Measurement]) -> dict[str, float]:
-    if suite == suites.REAL_LENSES:
+    if suite in (suites.REAL_LENSES, suites.DRAWN_LENSES):
+        name = "real_lenses" if suite == suites.REAL_LENSES else "drawn_lenses"
         rows = tables.lens_rows(measurements)
         straight = [row for row in rows if is_straight(row.camera)]
         figures = {
-            "real_lenses_removed": tables.removed_share(rows, applied=False),
-            "real_lenses_removed_as_applied": tables.removed_share(rows),
-            "real_lenses_harmed": float(np.mean([row.harmed for row in rows])),
+            f"{name}_removed": tables.removed_share(rows, applied=False),
+            f"{name}_removed_as_applied": tables.removed_share(rows),
+            f"{name}_harmed": float(np.mean([row.harmed for row in rows])),
         }
         if straight:
-            figures["straight_cameras_px"] = float(np.mean([row.applied_px for row in straight]))
+            figures[f"{name}_straight_px"] = float(np.mean([row.applied_px for row in straight]))
         return figures
     if suite == suites.OBLIQUE:
         return {

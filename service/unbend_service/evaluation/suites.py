@@ -22,8 +22,9 @@ from unbend_service.evaluation.oblique import oblique_cases
 from unbend_service.evaluation.one_camera import TOGETHER, camera_cases, together
 
 SYNTHETIC, NO_HARM, REAL_LENSES, OBLIQUE, TABLE_ONE = "synthetic", "no-harm", "real-lenses", "oblique", "table-1"
-ONE_CAMERA = "one-camera"
+ONE_CAMERA, DRAWN_LENSES = "one-camera", "drawn-lenses"
 SUITES = (SYNTHETIC, NO_HARM, REAL_LENSES, OBLIQUE, ONE_CAMERA, TABLE_ONE)
+"""Of photographs. `DRAWN_LENSES` needs drawn scenes besides."""
 _WHOLE_LONG_SIDE_PX = 512
 
 
@@ -82,10 +83,11 @@ def run_suite(
     """Method name -> its measurements; every method sees the same pictures, each of which is made once.
 
     Args:
-        name: one of SUITES.
+        name: one of SUITES, or DRAWN_LENSES.
         per_camera: photographs a camera of the real lenses.
         chessboards: folder of left01.jpg, right01.jpg and so on, for the real lenses.
-        scenes: more straight pictures for the oblique suite.
+        scenes: more straight pictures for the oblique suite; what the lenses of the drawn suite see. Photographs bring
+            a mild lens of their own, which counts as error of whoever straightens it; drawn scenes have none.
         quality: whether SSIM and MSE are measured where there is an original.
     """
     if name == ONE_CAMERA:
@@ -97,6 +99,8 @@ def run_suite(
         cases = (_whole(photograph) for photograph in photographs)
     elif name == REAL_LENSES:
         cases = _real_lenses(photographs, per_camera, chessboards)
+    elif name == DRAWN_LENSES:
+        cases = lens_cases(scenes or [], per_camera)
     elif name == OBLIQUE:
         cases = oblique_cases(photographs + (scenes or []))
     elif name == TABLE_ONE:
