@@ -195,6 +195,33 @@ async def test_a_frame_whose_worker_is_stopped_is_rendered_by_the_next(
     assert stopped not in {process.pid for process in worker_processes()}
 
 
+async def test_a_worker_that_hangs_has_a_deputy_by_then(make_pool: MakePool, meter: RecordingMeter) -> None:
+    """Nobody waits for the start of a process after the deadline of the one that hung: another stands by."""
+    pool = await make_pool(hang_s=4.0)
+    hanging = pool.state().workers[0].pid
+    source = frame(misbehaving.STOPPED_ONCE)
+    rendering = asyncio.create_task(pool.render(source, GRID, BLACK))
+    await until(lambda: len(worker_processes()) == 2)
+    assert pool.state().workers[0].pid == hanging
+    (deputy,) = {process.pid for process in worker_processes()} - {hanging}
+    np.testing.assert_array_equal(await rendering, expected(source))
+    assert pool.state().workers[0].pid == deputy
+    assert meter.restarts == {"hung": 1}
+
+
+async def test_a_deputy_goes_when_the_frame_comes_after_all(make_pool: MakePool, meter: RecordingMeter) -> None:
+    """A frame that takes long costs a process for that time, and no worker."""
+    pool = await make_pool(hang_s=6.0)
+    slow = pool.state().workers[0].pid
+    assert slow is not None
+    rendering = asyncio.create_task(pool.render(frame(misbehaving.STOPPED_ONCE), GRID, BLACK))
+    await until(lambda: len(worker_processes()) == 2)
+    os.kill(slow, signal.SIGCONT)
+    await rendering
+    await until(lambda: [process.pid for process in worker_processes()] == [slow])
+    assert not meter.restarts
+
+
 async def test_a_frame_that_hangs_two_workers_is_poison(make_pool: MakePool, meter: RecordingMeter) -> None:
     """A frame that no worker gets done with is given up before its deadline."""
     pool = await make_pool(hang_s=0.5)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 import signal
 from collections.abc import Iterable
-from dataclasses import dataclass
+from contextlib import suppress
 from typing import Protocol
 
 import structlog
 
 from unbend_service.adapters.renderers.channel import Done, Failed, Ready
 from unbend_service.adapters.renderers.jobs import Job
+from unbend_service.adapters.renderers.places import Place
 from unbend_service.adapters.renderers.selection import RendererOptions
 from unbend_service.adapters.renderers.storms import StormGuard
 from unbend_service.adapters.renderers.worker_process import WorkerProcess
@@ -23,6 +24,8 @@ log = structlog.get_logger(__name__)
 _START_TIMEOUT_S = 60.0
 #: A worker that lived so long, or was given a frame, was in order: its successor starts at once.
 _SOUND_LIFE_S = 2.0
+#: After this share of what a frame may take a deputy is started: should it hang, nobody waits for the start of another.
+_SUSPECT = 0.25
 _FAILURES_TO_GIVE_UP = 3
 _LONGEST_BACKOFF_S = 30.0
 _LAST_WORDS_S = 2.0
@@ -48,39 +51,6 @@ class Listener(Protocol):
         ...
 
 
-@dataclass(slots=True, eq=False)
-class _Place:
-    """Where a worker stands, and its successors after it.
-
-    Attributes:
-        failures: workers in a row that died here before they were of use.
-        timer: the limit of what it does now (starting, rendering one frame), or the wait before the next start.
-        verdict: why it was killed, if it was.
-    """
-
-    index: int
-    worker: WorkerProcess | None = None
-    restarts: int = 0
-    failures: int = 0
-    timer: asyncio.TimerHandle | None = None
-    verdict: str = ""
-
-    def stop_timer(self) -> None:
-        if self.timer is not None:
-            self.timer.cancel()
-            self.timer = None
-
-    def state(self) -> WorkerState:
-        worker = self.worker
-        if worker is None:
-            state = "dead"
-        elif worker.info is None:
-            state = "starting"
-        else:
-            state = "busy" if worker.held else "ready"
-        return WorkerState(f"render{self.index}", state, None if worker is None else worker.pid, self.restarts)
-
-
 class Supervisor:
     """Starts workers, watches them, and starts others in place of those that die or hang.
 
@@ -93,7 +63,7 @@ class Supervisor:
         self._options = options
         self._hang_s = hang_s
         self._listener = listener
-        self._places: list[_Place] = []
+        self._places: list[Place] = []
         self._first: asyncio.Future[RendererInfo] | None = None
         self._reaping: set[asyncio.Task[int]] = set()
         self._storm = StormGuard()
@@ -143,14 +113,14 @@ class Supervisor:
             RendererUnavailable: it said that it cannot have one, or died again and again.
         """
         self._first = asyncio.get_running_loop().create_future()
-        self._places.append(_Place(0))
+        self._places.append(Place(0))
         self._launch(self._places[0])
         return await self._first
 
     def start_others(self, count: int) -> None:
         """Starts as many as are missing to ``count``."""
         for index in range(len(self._places), count):
-            self._places.append(_Place(index))
+            self._places.append(Place(index))
             self._launch(self._places[index])
 
     def send(self, job: Job, worker: WorkerProcess) -> None:
@@ -161,7 +131,7 @@ class Supervisor:
             worker.kill()
             return
         if len(worker.sent) == 1:
-            self._watch(self._places[worker.index], self._hang_s, "hung")
+            self._watch_frame(self._places[worker.index])
 
     def unmap(self, slots: Iterable[int]) -> None:
         """Tells every worker that slots are gone."""
@@ -179,6 +149,7 @@ class Supervisor:
             self._first.set_exception(RendererUnavailable("The renderers were shut down before they had started."))
         for place in self._places:
             place.stop_timer()
+            self._dismiss(place)
             if place.worker is not None:
                 self._release(place.worker)
                 if place.worker.sent or place.worker.info is None:
@@ -187,30 +158,58 @@ class Supervisor:
         if self._reaping:
             await asyncio.wait(self._reaping)
 
-    def _launch(self, place: _Place) -> None:
+    def _launch(self, place: Place) -> None:
         place.timer = None
         place.verdict = ""
-        loop = asyncio.get_running_loop()
         try:
-            place.worker = WorkerProcess(place.index, self._factory, self._options, loop.time())
+            place.worker, place.deputy = place.deputy or self._started(place), None
         except OSError as error:
             self._last_error = f"{type(error).__name__}: {error}"
-            self._storm.note(loop.time(), self._last_error)
+            self._storm.note(asyncio.get_running_loop().time(), self._last_error)
             self._retry(place, "start_failed")
             return
-        loop.add_reader(place.worker.channel.fileno(), self._read, place, place.worker)
-        self._watch(place, _START_TIMEOUT_S, "start_timeout")
+        if place.worker.info is None:
+            self._watch(place, _START_TIMEOUT_S, "start_timeout")
+        else:
+            self._on_ready(place, place.worker, place.worker.info)
         self._listener.on_change()
 
-    def _read(self, place: _Place, worker: WorkerProcess) -> None:
-        while place.worker is worker:
+    def _started(self, place: Place) -> WorkerProcess:
+        loop = asyncio.get_running_loop()
+        worker = WorkerProcess(place.index, self._factory, self._options, loop.time())
+        loop.add_reader(worker.channel.fileno(), self._read, place, worker)
+        return worker
+
+    def _suspect(self, place: Place) -> None:
+        if place.deputy is None:
+            with suppress(OSError):  # it will be tried again when it is needed
+                place.deputy = self._started(place)
+
+    def _dismiss(self, place: Place) -> None:
+        """The deputy is not needed, or of no use."""
+        if place.deputy is not None:
+            deputy, place.deputy = place.deputy, None
+            deputy.kill()
+            self._release(deputy)
+
+    def _read(self, place: Place, worker: WorkerProcess) -> None:
+        while worker in (place.worker, place.deputy):
             try:
                 message = worker.receive()
             except BlockingIOError:
                 break
             except EOFError:
-                self._bury(place, worker)
+                if worker is place.deputy:
+                    self._dismiss(place)
+                else:
+                    self._bury(place, worker)
                 break
+            if worker is place.deputy:
+                if isinstance(message, Ready):
+                    worker.info = message.info
+                else:
+                    self._dismiss(place)
+                continue
             if isinstance(message, Ready):
                 self._on_ready(place, worker, message.info)
             elif isinstance(message, Failed) and message.task is None:
@@ -222,11 +221,12 @@ class Supervisor:
             else:
                 self._listener.on_answer(worker, message)
                 place.stop_timer()
+                self._dismiss(place)
                 if worker.sent:
-                    self._watch(place, self._hang_s, "hung")
+                    self._watch_frame(place)
         self._listener.on_change()
 
-    def _on_ready(self, place: _Place, worker: WorkerProcess, info: RendererInfo) -> None:
+    def _on_ready(self, place: Place, worker: WorkerProcess, info: RendererInfo) -> None:
         place.stop_timer()
         worker.info = self.info = info
         log.info("render worker ready", worker=place.index, pid=worker.pid, renderer=info.name, device=info.device)
@@ -239,7 +239,12 @@ class Supervisor:
         if self._first is not None and not self._first.done():
             self._first.set_exception(refusal.error)
 
-    def _watch(self, place: _Place, limit_s: float, verdict: str) -> None:
+    def _watch_frame(self, place: Place) -> None:
+        self._watch(place, self._hang_s, "hung")
+        loop = asyncio.get_running_loop()
+        place.suspicion = loop.call_later(_SUSPECT * self._hang_s, self._suspect, place)
+
+    def _watch(self, place: Place, limit_s: float, verdict: str) -> None:
         def condemn() -> None:
             if place.worker is not None:
                 place.verdict = verdict
@@ -248,7 +253,7 @@ class Supervisor:
         place.stop_timer()
         place.timer = asyncio.get_running_loop().call_later(limit_s, condemn)
 
-    def _bury(self, place: _Place, worker: WorkerProcess) -> None:
+    def _bury(self, place: Place, worker: WorkerProcess) -> None:
         place.worker = None
         place.stop_timer()
         status = worker.exit_status(_LAST_BREATH_S)
@@ -276,7 +281,7 @@ class Supervisor:
         self._listener.on_death(worker, killed)
         self._retry(place, reason)
 
-    def _retry(self, place: _Place, reason: str) -> None:
+    def _retry(self, place: Place, reason: str) -> None:
         place.failures += 1
         if self._first is not None and not self._first.done() and place.failures >= _FAILURES_TO_GIVE_UP:
             self._first.set_exception(RendererUnavailable(f"Render workers die at start: {self._last_error}."))
