@@ -1,13 +1,11 @@
 from __future__ import annotations
 
-import asyncio
 import subprocess
 import sys
 
 import pytest
 
-from unbend_service import allocator
-from unbend_service.allocator import heap, tended
+from unbend_service.allocator import heap
 
 #: Resident MiB of threads' own arenas: each of 32 threads frees what it had, but for a crumb at the end of it.
 PROGRAM = """
@@ -84,22 +82,3 @@ def test_what_is_handed_out_and_what_is_kept_free_are_told_apart() -> None:
     assert after is not None
     assert during.used_bytes - before.used_bytes > 60 << 20
     assert after.used_bytes - before.used_bytes < 8 << 20
-
-
-async def test_memory_is_given_back_at_rest(monkeypatch: pytest.MonkeyPatch) -> None:
-    """While calls are under way it is left alone, for a while; soon after the last it is given back."""
-    given = asyncio.Event()
-    active = 1
-    monkeypatch.setattr(allocator, "REST_S", 0.01)
-    loop = asyncio.get_running_loop()
-    monkeypatch.setattr(allocator, "give_back", lambda: loop.call_soon_threadsafe(given.set))
-    with tended(lambda: active):
-        await asyncio.sleep(0.1)
-        assert not given.is_set()
-        active = 0
-        await asyncio.wait_for(given.wait(), 10)
-        active = 1
-        await asyncio.sleep(0.05)
-        given.clear()
-        monkeypatch.setattr(allocator, "_BUSY_S", 0.0)
-        await asyncio.wait_for(given.wait(), 10)

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import asyncio
 import ctypes
 import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 _M_ARENA_MAX = -8
 _ARENAS = 2
 #: Nothing was to be done for so long: what is free goes back to the system.
 REST_S = 5.0
-#: Under load it goes back only so often: it takes some milliseconds, in which others who allocate wait.
-_BUSY_S = 60.0
 
 
 class _MallInfo2(ctypes.Structure):
@@ -82,26 +77,6 @@ def give_back() -> None:
     trim = _function("malloc_trim")
     if trim is not None:
         trim(0)
-
-
-@contextmanager
-def tended(active: Callable[[], int]) -> Iterator[None]:
-    """Gives free memory back now and then: when ``active()`` calls are none, or else once a minute."""
-    task = asyncio.create_task(_tend(active))
-    try:
-        yield
-    finally:
-        task.cancel()
-
-
-async def _tend(active: Callable[[], int]) -> None:
-    clock = asyncio.get_running_loop().time
-    given_s = clock()
-    while True:
-        await asyncio.sleep(REST_S)
-        if not active() or clock() - given_s >= _BUSY_S:
-            given_s = clock()
-            await asyncio.to_thread(give_back)
 
 
 def _function(name: str) -> ctypes._NamedFuncPointer | None:

@@ -18,10 +18,11 @@ import structlog
 import uvicorn
 from fastapi import FastAPI
 
-from unbend_service.allocator import share_arenas, tended
+from unbend_service.allocator import share_arenas
 from unbend_service.application.service import Service
 from unbend_service.exposure import check_exposure
 from unbend_service.refreshing import refreshed
+from unbend_service.resting import tended
 from unbend_service.settings import Settings
 from unbend_service.transport.local.listener import MemoryListener
 from unbend_service.transport.rest.app import create_app, create_ops_app
