@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import socket
 import ssl
@@ -15,10 +16,14 @@ from pathlib import Path
 import grpc
 import pytest
 import trustme
+from typer.testing import CliRunner
 
 import unbend
 from tests.acceptance.conftest import Server, start_server, stop_server
+from unbend_service.cli import app
 from unbend_service.domain.errors import InvalidOption
+from unbend_service.domain.grid import Grid
+from unbend_service.domain.records import GridRecord
 from unbend_service.settings import Settings
 from unbend_service.transport.tls import Certificates, read_certificates
 
@@ -102,6 +107,20 @@ def test_plain_text_is_refused_by_every_listener(locked: Locked) -> None:
     client = unbend.Client(locked.server.grpc, timeout_s=3, retries=0)
     with client, pytest.raises((unbend.Unreachable, unbend.DeadlineExceeded)):
         client.estimate(b"nothing")
+
+
+def test_a_command_speaks_tls_and_shows_its_certificate(locked: Locked, tmp_path: Path) -> None:
+    """With the authorities of the server and a certificate of its own it is let in."""
+    record, file = GridRecord(Grid.identity()), tmp_path / "grid.json"
+    file.write_text(json.dumps(record.to_dict()))
+    reached = ["grid", "import", str(file), "--server", locked.server.grpc, "--ca", str(locked.here.ca)]
+    shown = ["--cert", str(locked.client.cert), "--key", str(locked.client.key)]
+    done = CliRunner().invoke(app, [*reached, *shown])
+    assert done.exit_code == 0, done.output
+    assert record.id in done.output
+    half = CliRunner().invoke(app, [*reached, *shown[:2]])
+    assert half.exit_code == 3
+    assert "go together" in half.output
 
 
 def test_a_client_without_a_certificate_or_with_a_strangers_is_refused(locked: Locked) -> None:

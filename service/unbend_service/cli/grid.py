@@ -11,6 +11,7 @@ from rich.table import Table
 
 from unbend_service.cli.grid_source import load_record, store_record
 from unbend_service.cli.reporting import console, errors_reported, fail, print_json
+from unbend_service.cli.server import Server, reaches_server
 from unbend_service.domain.errors import InvalidOption
 from unbend_service.domain.exchange import Direction, ExportFormat, ExportOptions, ImportFormat, ImportOptions
 from unbend_service.domain.fit import Fit, check_strength
@@ -25,9 +26,6 @@ grid = typer.Typer(name="grid", help="Look at grids, and take them to and from o
 GridArgument = Annotated[
     str, typer.Argument(metavar="GRID", help="A JSON file, or an id on the server or in the private store.")
 ]
-ServerOption = Annotated[
-    str | None, typer.Option("--server", metavar="HOST:PORT", help="gRPC address of a server that keeps the grid.")
-]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace OUT if it is there.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 _BY_SUFFIX = {
@@ -41,7 +39,8 @@ _BY_SUFFIX = {
 
 
 @grid.command()
-def show(source: GridArgument, server: ServerOption = None, as_json: JsonOption = False) -> None:
+@reaches_server
+def show(source: GridArgument, server: Server | None = None, as_json: JsonOption = False) -> None:
     """Say what a grid does. Unlike `unbend show`, which draws it over a picture."""
     with errors_reported():
         record = load_record(source, server)
@@ -59,6 +58,7 @@ def show(source: GridArgument, server: ServerOption = None, as_json: JsonOption 
 
 
 @grid.command()
+@reaches_server
 def export(
     source: GridArgument,
     target: Annotated[Path, typer.Argument(metavar="OUT", help="Its suffix chooses the format if --format does not.")],
@@ -72,7 +72,7 @@ def export(
     ] = Direction.UNDISTORT,
     fit: Annotated[str, typer.Option(help="keep, crop, full, or a number 0..1 between crop and full.")] = "keep",
     strength: Annotated[float, typer.Option(help="0..1, blend with the identity.")] = 1.0,
-    server: ServerOption = None,
+    server: Server | None = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -88,13 +88,14 @@ def export(
 
 
 @grid.command("import")
+@reaches_server
 def read(
     source: Annotated[Path, typer.Argument(metavar="IN", help="A file of another program.")],
     target: Annotated[Path | None, typer.Argument(metavar="[OUT]", help="A JSON file to write the grid to.")] = None,
     kind: Annotated[ImportFormat | None, typer.Option("--format", help="What IN is; by default by its suffix.")] = None,
     direction: Annotated[Direction, typer.Option(help="Which picture the map in IN draws.")] = Direction.UNDISTORT,
     points: Annotated[int, typer.Option(min=2, max=1025, help="Rows and columns of the grid that is made.")] = 129,
-    server: ServerOption = None,
+    server: Server | None = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -109,10 +110,11 @@ def read(
 
 
 @grid.command()
+@reaches_server
 def invert(
     source: GridArgument,
     target: Annotated[Path, typer.Argument(metavar="OUT", help="A JSON file.")],
-    server: ServerOption = None,
+    server: Server | None = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -136,7 +138,7 @@ def _write(record: GridRecord, target: Path, kind: ExportFormat, options: Export
 
 
 def _import(
-    source: Path, kind: ImportFormat, options: ImportOptions, target: Path | None, server: str | None
+    source: Path, kind: ImportFormat, options: ImportOptions, target: Path | None, server: Server | None
 ) -> GridRecord:
     record = asyncio.run(build_exchange().read(source.read_bytes(), kind, options))
     if target is not None:

@@ -10,7 +10,8 @@ from typing import TypeVar
 import unbend
 from unbend_service.application.ports import GridStore
 from unbend_service.cli.serve import read_settings
-from unbend_service.domain.errors import GridNotFound, InvalidOption, Unavailable, UnbendError
+from unbend_service.cli.server import Server
+from unbend_service.domain.errors import GridNotFound, InvalidOption, Refused, Unavailable, UnbendError
 from unbend_service.domain.exchange import ImportFormat, ImportOptions
 from unbend_service.domain.grid import Grid
 from unbend_service.domain.guides import Guides
@@ -20,7 +21,7 @@ from unbend_service.wiring import build_exchange, build_store
 T = TypeVar("T")
 
 
-def load_record(source: str, server: str | None) -> GridRecord:
+def load_record(source: str, server: Server | None) -> GridRecord:
     """The record of a JSON file if there is one of that name, else of that id on ``server`` or in the private store.
 
     The private store outlives a command if it is ``sqlite`` (UNBEND_GRID_STORE).
@@ -36,7 +37,7 @@ def load_record(source: str, server: str | None) -> GridRecord:
     return asyncio.run(_privately(lambda store: store.get(source)))
 
 
-def store_record(record: GridRecord, server: str | None) -> None:
+def store_record(record: GridRecord, server: Server | None) -> None:
     """Keeps the grid on ``server``, or in the private store. Raises as :func:`load_record`."""
     if server is not None:
         _called(server, lambda client: client.grids.put(unbend.Grid(record.grid.source)))
@@ -52,20 +53,22 @@ async def _privately(call: Callable[[GridStore], Awaitable[T]]) -> T:
         await store.close()
 
 
-def _called(server: str, call: Callable[[unbend.Client], unbend.GridRecord]) -> unbend.GridRecord:
-    with unbend.Client(server) as client:
-        try:
+def _called(server: Server, call: Callable[[unbend.Client], unbend.GridRecord]) -> unbend.GridRecord:
+    try:
+        with unbend.Client(server.address, **server.arguments) as client:
             return call(client)
-        except unbend.UnbendError as error:
-            raise translated(error, server) from error
+    except unbend.UnbendError as error:
+        raise translated(error, server) from error
 
 
-def translated(error: unbend.UnbendError, server: str) -> UnbendError:
+def translated(error: unbend.UnbendError, server: Server) -> UnbendError:
     """An error of the client as one that commands report: what was sent, or that the server cannot do it now."""
     if isinstance(error, unbend.GridNotFound):
         return GridNotFound(str(error))
     if isinstance(error, unbend.InvalidInput):
         return InvalidOption(str(error))
+    if isinstance(error, unbend.Refused):
+        return Refused(f"{server}: {error}", allowed="a token: --token-file or UNBEND_TOKEN")
     return Unavailable(f"{server}: {error}")
 
 

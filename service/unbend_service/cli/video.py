@@ -13,6 +13,7 @@ from unbend_service.application.correction import CorrectOptions
 from unbend_service.cli.grid_source import load_record
 from unbend_service.cli.reporting import errors, errors_reported, fail, print_json
 from unbend_service.cli.serve import read_settings
+from unbend_service.cli.server import Server, reaches_server
 from unbend_service.cli.video_run import Result, Wish, run
 from unbend_service.domain.errors import InvalidOption
 from unbend_service.domain.fit import Fit, check_strength
@@ -21,6 +22,7 @@ from unbend_service.domain.records import Correct
 EXIT_INTERRUPTED = 130
 
 
+@reaches_server
 def video(
     source: Annotated[str, typer.Argument(metavar="IN", help="A file, a URL (rtsp, http), or - for y4m from a pipe.")],
     target: Annotated[str, typer.Argument(metavar="OUT", help="A file, its suffix says of which kind, or - for y4m.")],
@@ -40,7 +42,7 @@ def video(
     ] = None,
     preset: Annotated[str | None, typer.Option(help="Speed, in the encoder's words [medium, medium, 4, 8].")] = None,
     preview: Annotated[bool, typer.Option("--preview", help="Write original and result side by side.")] = False,
-    server: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="gRPC address of a running server.")] = None,
+    server: Server | None = None,
     model: Annotated[str | None, typer.Option(help="Name of a shipped model, or a path.")] = None,
     workers: Annotated[int, typer.Option(min=0, help="Render workers; 0: one a core.")] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT if it is there.")] = False,

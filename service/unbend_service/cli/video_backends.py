@@ -14,6 +14,7 @@ from unbend_service.application.service import Service
 from unbend_service.application.video import DrawFrame, estimate_over
 from unbend_service.cli.grid_source import record_of, translated
 from unbend_service.cli.private import private_service
+from unbend_service.cli.server import Server
 from unbend_service.domain.errors import InvalidFrame
 from unbend_service.domain.frames import Bytes, Frame
 from unbend_service.domain.orientation import Orientation
@@ -69,7 +70,7 @@ class PrivateBackend:
 class ServerBackend:
     """A server that is running somewhere."""
 
-    def __init__(self, client: unbend.AsyncClient, server: str) -> None:
+    def __init__(self, client: unbend.AsyncClient, server: Server) -> None:
         self._client = client
         self._server = server
 
@@ -125,13 +126,17 @@ class ServerBackend:
 
 
 @asynccontextmanager
-async def opened_backend(settings: Settings, server: str | None) -> AsyncIterator[PrivateBackend | ServerBackend]:
+async def opened_backend(settings: Settings, server: Server | None) -> AsyncIterator[PrivateBackend | ServerBackend]:
     """A private service that is started and ended here, or the server at ``host:port``."""
     if server is None:
         async with private_service(settings) as service:
             yield PrivateBackend(service)
     else:
-        async with unbend.AsyncClient(server) as client:
+        try:
+            client = unbend.AsyncClient(server.address, **server.arguments)
+        except unbend.UnbendError as error:
+            raise translated(error, server) from error
+        async with client:
             yield ServerBackend(client, server)
 
 

@@ -17,6 +17,7 @@ from unbend_service.adapters.video.writing import PyavWriter
 from unbend_service.adapters.video.y4m import Y4mWriter
 from unbend_service.application.correction import CorrectOptions, leaves_alone
 from unbend_service.application.video import Passenger, Picture, Progress, copy_video, correct_video
+from unbend_service.cli.server import Server
 from unbend_service.cli.video_backends import Prepared, PrivateBackend, ServerBackend, opened_backend
 from unbend_service.cli.video_progress import shown
 from unbend_service.domain.frames import Frame
@@ -37,7 +38,7 @@ class Wish:
     preset: str | None
     preview: bool
     samples: int
-    server: str | None
+    server: Server | None
     grid: GridRecord | None
     options: CorrectOptions
     quiet: bool
