@@ -13,17 +13,24 @@ RUN apt-get update \
 RUN python3 -m venv /opt/unbend
 WORKDIR /src
 ARG EXTRAS="service redis export lensfun otel"
-# The dependencies make a layer of their own, because they change less often than the code.
-COPY pyproject.toml constraints.txt ./
+ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_REQUIRE_HASHES=1
+# The dependencies make a layer of their own, because they change less often than the code. Each is known by its hash. Two have
+# no wheel for aarch64: there they are built from sources that are known by theirs.
+COPY requirements.lock requirements-build.lock ./
 COPY deploy/image/requirements.py deploy/image/
 RUN --mount=type=secret,id=pip,target=/etc/pip.conf --mount=type=secret,id=ca,target=/etc/ssl/build-ca.pem \
     python3 deploy/image/requirements.py ${EXTRAS} > requirements.txt \
- && /opt/unbend/bin/pip install --no-cache-dir --disable-pip-version-check -c constraints.txt -r requirements.txt \
- && /opt/unbend/bin/pip install --no-cache-dir --disable-pip-version-check -c constraints.txt hatchling --target /opt/build
-COPY README.md LICENSE ./
+ && /opt/unbend/bin/pip install --only-binary=:all: -r requirements-build.lock --target /opt/build \
+ && if [ "$(dpkg --print-architecture)" != amd64 ]; then \
+      apt-get update && apt-get install -y --no-install-recommends g++ python3-dev libegl-dev libgl-dev libx11-dev && rm -rf /var/lib/apt/lists/* \
+   && python3 deploy/image/requirements.py --built ${EXTRAS} > built.txt \
+   && PYTHONPATH=/opt/build /opt/unbend/bin/pip install --no-deps --no-build-isolation --no-binary=:all: -r built.txt; \
+    fi \
+ && /opt/unbend/bin/pip install --only-binary=:all: -r requirements.txt
+COPY pyproject.toml README.md LICENSE ./
 COPY client client
 COPY service service
-RUN PYTHONPATH=/opt/build /opt/unbend/bin/pip install --no-cache-dir --no-deps --no-build-isolation --no-index . \
+RUN PYTHONPATH=/opt/build PIP_REQUIRE_HASHES=0 /opt/unbend/bin/pip install --no-deps --no-build-isolation --no-index . \
  && /opt/unbend/bin/pip uninstall -y --quiet pip setuptools \
  && find /opt/unbend -type d -name tests -prune -exec rm -rf {} +
 

@@ -163,7 +163,7 @@ $(VENV)/.supply: pyproject.toml $(CONSTRAINTS) $(VENV)/.dev
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS) --group supply
 	@touch $@
 
-lock: setup-dev  ## Write requirements.lock: versions and hashes of all that the service needs
+lock: setup-dev  ## Write requirements.lock and requirements-build.lock: versions and hashes of what the image installs
 	$(BIN)/python deploy/lock.py
 
 audit: $(VENV)/.supply  ## Ask for known vulnerabilities of requirements.lock (AUDIT="-s osv"); not asked is not passed

@@ -2,10 +2,11 @@ from __future__ import annotations
 
 import json
 import re
+import tomllib
 from pathlib import Path
 
 from deploy.audit import LOCK, verdict
-from deploy.lock import wanted
+from deploy.lock import EXTRAS, wanted
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -30,5 +31,7 @@ def test_the_lock_holds_what_is_asked_for_at_the_versions_that_are_tested() -> N
     for name, version in tested.items():
         key = re.sub(r"[-_.]+", "-", name).lower()
         assert locked.get(key, version) == version, name
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert set(EXTRAS) == set(project["optional-dependencies"])
     for requirement in wanted():
         assert re.split(r"[^A-Za-z0-9._-]", requirement)[0].lower() in locked, requirement

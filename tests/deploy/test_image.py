@@ -49,8 +49,25 @@ def test_it_names_no_registry_and_no_mirror() -> None:
         assert "." not in image.partition("/")[0] or "/" not in image, image
 
 
-def test_the_extras_are_installed_with_their_versions() -> None:
-    project = {"dependencies": ["b>=1"], "optional-dependencies": {"x": ["a>=2"], "y": ["c"]}}
-    assert requirements(project, ["x"]) == ["a>=2", "b>=1"]
+def test_only_what_the_lock_knows_by_its_hash_is_installed() -> None:
+    """Every package of the image is one that was locked: pip refuses whatever has another content."""
+    assert "PIP_REQUIRE_HASHES=1" in DOCKERFILE
+    assert "constraints.txt" not in DOCKERFILE
+    (extras,) = re.findall(r'^ARG EXTRAS="(.+)"$', DOCKERFILE, re.MULTILINE)
+    needed = requirements((ROOT / "requirements.lock").read_text(), extras.split())
+    names = re.findall(r"^([a-z0-9-]+)==\S+ \\\n    --hash=sha256:[0-9a-f]{64}", needed, re.MULTILINE)
+    assert len(names) == needed.count("==")
+    assert {"numpy", "fastapi", "redis", "openexr", "lensfunpy", "opentelemetry-sdk"} <= set(names)
+    assert "av" not in names
+
+
+def test_an_image_may_have_fewer_extras() -> None:
+    entry = "{}==1 \\\n    --hash=sha256:0\n    # for {}"
+    lock = "# Written.\n\n" + "\n".join(
+        [entry.format("a", "core x"), entry.format("b-c", "x"), entry.format("d", "y z")]
+    )
+    assert requirements(lock, []) == entry.format("a", "core x")
+    assert requirements(lock, ["z"]).splitlines()[3:] == entry.format("d", "y z").splitlines()
+    assert requirements(lock, ["x", "z"], only=["b-c"]) == entry.format("b-c", "x")
     with pytest.raises(KeyError):
-        requirements(project, ["z"])
+        requirements(lock, ["w"])
