@@ -147,6 +147,12 @@ class Settings(BaseSettings):
 
     streams: int = Field(256, ge=1, description="Streams that may be open at once.")
     stream_in_flight: int = Field(8, ge=1, le=256, description="Frames of one stream that may be under way at once.")
+    stream_frames_bytes: int = Field(
+        1 << 30,
+        ge=1024,
+        description="Memory of the frames that all streams hold; beyond it a stream reads the next one when it holds "
+        "none.",
+    )
     stream_idle_s: float = Field(60.0, gt=0, description="A stream without a frame for so long is closed.")
     stream_estimate_frames: int = Field(
         5, ge=1, le=64, description="Frames that the grid of a stream is estimated over, unless the stream says."

@@ -1,8 +1,10 @@
 from __future__ import annotations
 
+import asyncio
+
 import pytest
 
-from unbend_service.application.budget import MemoryBudget
+from unbend_service.application.budget import FrameMemory, MemoryBudget
 from unbend_service.domain.errors import MemoryFull
 
 
@@ -42,3 +44,17 @@ def test_a_request_that_fails_gives_back_too() -> None:
     with pytest.raises(RuntimeError):
         fail()
     assert budget.used_bytes == 0
+
+
+async def test_a_stream_that_holds_nothing_never_waits() -> None:
+    """However much the others hold; who holds a frame goes on when one of them lets go."""
+    memory = FrameMemory(100)
+    memory.take(100)
+    assert not memory.full(0)
+    assert memory.full(10)
+    waiting = asyncio.create_task(memory.changed())
+    await asyncio.sleep(0)
+    assert not waiting.done()
+    memory.give(1)
+    await asyncio.wait_for(waiting, 10)
+    assert not memory.full(10)

@@ -153,6 +153,12 @@ async def build() -> AsyncIterator[Build]:
     assert len(asyncio.all_tasks()) == 1, "a stream left a task behind"
 
 
+async def until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(20):
+        while not condition():  # noqa: ASYNC110 what is waited for sets no event
+            await asyncio.sleep(0.01)
+
+
 def frame_of(index: int, size_bytes: int = WIDTH * HEIGHT) -> StreamFrame:
     return StreamFrame(index, index * 40_000, bytes([index % 256]) * size_bytes)
 
@@ -660,3 +666,45 @@ async def test_encoded_frames_come_back_encoded_and_broken_ones_fail_alone(build
         "invalid_frame",
     ]
     assert cv2.imdecode(np.frombuffer(answers[0].data, np.uint8), cv2.IMREAD_COLOR).shape == (48, 64, 3)
+
+
+async def test_frames_of_all_streams_share_one_bound_of_memory(build: Build) -> None:
+    """Beyond it a stream reads its next frame when it holds none: none starves, and each frame is answered."""
+    bench = build(stream_frames_bytes=1024)
+    bench.pool.gate = asyncio.Event()
+    large, guides = RawFormat(PixelFormat.GRAY8, 32, 32), DrawnGuides(barrel_guides())
+    read: Counter[int] = Counter()
+
+    async def frames(stream: int) -> AsyncIterator[StreamFrame]:
+        for index in range(4):
+            read[stream] += 1
+            yield frame_of(index, 1024)
+
+    config = StreamConfig(large, grid_source=guides)
+    running = [asyncio.create_task(bench.collect(config, frames(stream))) for stream in range(3)]
+    await until(lambda: bench.pool.under_way == 3)
+    await asyncio.sleep(0.05)
+    assert read == {0: 1, 1: 1, 2: 1}
+    bench.pool.gate.set()
+    for events in await asyncio.gather(*running):
+        assert [e.index for e in events if isinstance(e, StreamResult)] == [0, 1, 2, 3]
+    again = [asyncio.create_task(bench.collect(config, frames(9)))]
+    assert len((await asyncio.gather(*again))[0]) == 5
+
+
+async def test_a_stream_that_is_given_up_gives_its_memory_back(build: Build) -> None:
+    """Frames that were read and never answered do not count for ever."""
+    bench = build(stream_frames_bytes=1024)
+    bench.pool.gate = asyncio.Event()
+    config = StreamConfig(RawFormat(PixelFormat.GRAY8, 32, 32), grid_source=DrawnGuides(barrel_guides()))
+
+    async def endless() -> AsyncIterator[StreamFrame]:
+        for index in range(1000):
+            yield frame_of(index, 1024)
+
+    given_up = asyncio.create_task(bench.collect(config, endless()))
+    await until(lambda: bench.pool.under_way > 0)
+    given_up.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await given_up
+    assert bench.streams.memory.used_bytes == 0

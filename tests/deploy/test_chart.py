@@ -122,7 +122,7 @@ def test_what_callers_can_make_it_hold_fits_into_the_memory_of_its_processes(man
         limit = mebibytes(container(pod)["resources"]["limits"]["memory"]) << 20
         given = {name: int(value) for name, value in environment(pod).items() if value.isdigit()}
         files = 2 * (64 << 20) + given["UNBEND_SHARED_MEMORY_BYTES"]
-        pictures = given["UNBEND_PICTURES_BYTES"] + given["UNBEND_BODIES_BYTES"]
+        pictures = sum(given[f"UNBEND_{what}_BYTES"] for what in ("PICTURES", "BODIES", "STREAM_FRAMES"))
         decoding = given["UNBEND_DECODERS"] * given["UNBEND_DECODE_MEMORY_BYTES"]
         assert decoding + pictures <= 3 * (limit - files) // 4
         assert given["UNBEND_DECODE_MEMORY_BYTES"] >= 512 << 20  # a photograph of 100 million pixels

@@ -43,6 +43,14 @@ def test_both_ways_to_draw_are_in_it() -> None:
     assert "egl_vendor.d/10_nvidia.json" in FINAL
 
 
+def test_what_is_copied_is_sent_to_the_builder() -> None:
+    ignored = (ROOT / ".dockerignore").read_text().splitlines()
+    sent = [line[1:] for line in ignored if line.startswith("!")]
+    for line in re.findall(r"^COPY (?!--from)(.+)$", DOCKERFILE, re.MULTILINE):
+        for source in line.split()[:-1]:
+            assert any(f"{each}/".startswith(f"{source}/") or source.startswith(f"{each}/") for each in sent), source
+
+
 def test_it_names_no_registry_and_no_mirror() -> None:
     assert not re.search(r"https?://|--index-url|--extra-index-url|--trusted-host", DOCKERFILE)
     for image in re.findall(r"^(?:FROM|ARG BASE=)\s*(\S+)", DOCKERFILE, re.MULTILINE):

@@ -1,11 +1,14 @@
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
 from unbend_service.domain.errors import InvalidFrame, InvalidOption
 from unbend_service.domain.frames import (
     BLACK,
+    BORDER_PATTERN,
     TRANSPARENT,
     Border,
     Frame,
@@ -59,3 +62,30 @@ def test_planar_frames_have_no_alpha() -> None:
     """i420 and nv12 have no room for it."""
     with pytest.raises(InvalidFrame):
         with_alpha(Frame(PixelFormat.I420, 2, 2, np.zeros(6, np.uint8)))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "black",
+        "White",
+        "tranSparent",
+        "ff8000",
+        "#FF8000",
+        "ff800080",
+        "",
+        "whitf",
+        "ff80",
+        "#ff800",
+        "xblack",
+        "##ff8000",
+    ],
+)
+def test_the_pattern_of_the_documentation_says_what_is_read(text: str) -> None:
+    """Whoever goes by it is never refused, and is told of all that is taken."""
+    try:
+        Border.parse(text)
+    except InvalidOption:
+        assert not re.search(BORDER_PATTERN, text)
+    else:
+        assert re.search(BORDER_PATTERN, text)

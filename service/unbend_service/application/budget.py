@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -62,3 +63,39 @@ class MemoryBudget:
                 setting=self._setting,
                 retry_after_s=_RETRY_AFTER_S,
             )
+
+
+class FrameMemory:
+    """Bounds the bytes of the frames that all streams hold at once: a stream that finds no room does not read on.
+
+    A stream that holds no frame may read one all the same, so that none waits for another for ever. For one thread.
+
+    Args:
+        limit_bytes: of all of them together, but for one frame of each stream.
+
+    Attributes:
+        used_bytes: held now.
+    """
+
+    def __init__(self, limit_bytes: int) -> None:
+        self._limit_bytes = limit_bytes
+        self._given = asyncio.Event()
+        self.used_bytes = 0
+
+    def full(self, held_bytes: int) -> bool:
+        """Whether a stream that holds ``held_bytes`` has to wait."""
+        return held_bytes > 0 and self.used_bytes >= self._limit_bytes
+
+    def take(self, size_bytes: int) -> None:
+        """A frame was read; its size is known only now."""
+        self.used_bytes += size_bytes
+
+    def give(self, size_bytes: int) -> None:
+        """A frame was answered, or went."""
+        self.used_bytes -= size_bytes
+        self._given.set()
+
+    async def changed(self) -> None:
+        """Waits until some stream gives memory back."""
+        self._given.clear()
+        await self._given.wait()

@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
 
+from unbend_service.application.budget import FrameMemory
 from unbend_service.application.stream_frames import FrameAnswers
 from unbend_service.application.stream_grid import FixedGrid, StreamGrid
 from unbend_service.application.stream_messages import (
@@ -31,6 +32,7 @@ class _Entry:
     timestamp_us: int
     answer: asyncio.Future[StreamResult]
     frame: StreamFrame | None
+    size_bytes: int = 0
     started: bool = False
 
 
@@ -43,6 +45,7 @@ class StreamSession:
         resumed: whether the stream id was known and its grid is reused.
         ended_with: why the service ended it early, if it did.
         last_index: of the last frame whose answer was taken.
+        memory: that the frames of all streams share.
     """
 
     stream_id: str
@@ -50,6 +53,7 @@ class StreamSession:
     grid: StreamGrid
     answers: FrameAnswers
     owner: asyncio.Task[object]
+    memory: FrameMemory
     resumed: bool = False
     ended_with: UnbendError | None = None
     last_index: int | None = None
@@ -58,6 +62,7 @@ class StreamSession:
     _reader: asyncio.Task[None] | None = None
     _started: int = 0
     _unanswered: int = 0
+    _held_bytes: int = 0
     _waiting: _Entry | None = None
     _room: asyncio.Event = field(default_factory=asyncio.Event)
     _draining: bool = False
@@ -126,6 +131,8 @@ class StreamSession:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
         await self.grid.close()
+        self.memory.give(self._held_bytes)
+        self._held_bytes = 0
         self._waiting = None
         while not self._entries.empty():
             self._entries.get_nowait()
@@ -157,11 +164,16 @@ class StreamSession:
             self.grid.complete()
             self._room.clear()
             await self._room.wait()
+        while self.memory.full(self._held_bytes):
+            self.grid.complete()
+            await self.memory.changed()
         return True
 
     def _accept(self, frame: StreamFrame) -> None:
         answer: asyncio.Future[StreamResult] = asyncio.get_running_loop().create_future()
-        entry = _Entry(frame.index, frame.timestamp_us, answer, frame)
+        entry = _Entry(frame.index, frame.timestamp_us, answer, frame, len(frame.data))
+        self._held_bytes += entry.size_bytes
+        self.memory.take(entry.size_bytes)
         self._unanswered += 1
         self._entries.put_nowait(entry)
         if self.config.delivery is Delivery.LOSSLESS or self._started < self._at_once:
@@ -196,10 +208,17 @@ class StreamSession:
     def _drop(self, entry: _Entry) -> None:
         self.answers.meter.frame("dropped")
         entry.frame = None
+        self._let_go(entry)
         entry.answer.set_result(StreamResult(entry.index, entry.timestamp_us, FrameStatus.DROPPED))
+
+    def _let_go(self, entry: _Entry) -> None:
+        self._held_bytes -= entry.size_bytes
+        self.memory.give(entry.size_bytes)
+        entry.size_bytes = 0
 
     def _answered(self, entry: _Entry) -> None:
         self._unanswered -= 1
+        self._let_go(entry)
         self._room.set()
         if entry.started:
             self._started -= 1

@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 from unbend_service.application.blocking import BlockingWork
+from unbend_service.application.budget import FrameMemory
 from unbend_service.application.correction import Correction
 from unbend_service.application.estimation import Estimation
 from unbend_service.application.ports import GridStore, ImageCodec, Meter
@@ -22,7 +23,11 @@ from unbend_service.settings import Settings
 
 
 class Streams:
-    """Opens streams. A stream id has at most one session here: opening it again ends the older one."""
+    """Opens streams. A stream id has at most one session here: opening it again ends the older one.
+
+    Attributes:
+        memory: of the frames that all of them hold.
+    """
 
     def __init__(
         self,
@@ -44,6 +49,7 @@ class Streams:
         self._regions = regions
         self._settings = settings
         self._turns = Turns(max(1, settings.queue_frames // 2), settings.render_deadline_s)
+        self.memory = FrameMemory(settings.stream_frames_bytes)
         self._live: dict[str, StreamSession] = {}
         self._draining = False
 
@@ -129,4 +135,4 @@ class Streams:
             self._regions,
             self._settings,
         )
-        return StreamSession(stream_id, config, grid, answers, owner)
+        return StreamSession(stream_id, config, grid, answers, owner, self.memory)

@@ -179,7 +179,7 @@ class Border:
         if named is not None:
             return named
         digits = text.removeprefix("#")
-        if not re.fullmatch(r"[0-9a-fA-F]{6}(?:[0-9a-fA-F]{2})?", digits):
+        if not re.fullmatch(_DIGITS, digits):
             raise InvalidOption(f"border={text!r} is not known.", allowed=BORDERS_ALLOWED)
         return cls(*bytes.fromhex(digits))
 
@@ -214,3 +214,6 @@ _NAMED_BORDERS = {
     "grey": Border(128, 128, 128),
     "transparent": TRANSPARENT,
 }
+_DIGITS = "[0-9a-fA-F]{6}(?:[0-9a-fA-F]{2})?"
+#: What :meth:`Border.parse` reads, as a regular expression of ECMA 262, which knows no case-insensitive part.
+BORDER_PATTERN = f"^(?:{'|'.join(''.join(f'[{c.upper()}{c}]' for c in name) for name in _NAMED_BORDERS)}|#?{_DIGITS})$"

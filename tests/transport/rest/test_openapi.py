@@ -5,6 +5,8 @@ from typing import Any
 import httpx
 import pytest
 
+from unbend_service.domain.frames import BORDER_PATTERN
+
 from .conftest import Bench
 
 
@@ -111,3 +113,10 @@ async def test_two_applications_do_not_share_a_document(bench: Bench) -> None:
     """The document is built once per application, and asked for again it is the same."""
     first = (await bench.client.get("/openapi.json")).json()
     assert (await bench.client.get("/openapi.json")).json() == first
+
+
+async def test_a_border_is_described_by_a_pattern(document: dict[str, Any]) -> None:
+    """A generator of clients knows what a border may be."""
+    parameters = document["paths"]["/v1/correct"]["post"]["parameters"]
+    (border,) = (parameter["schema"] for parameter in parameters if parameter["name"] == "border")
+    assert border["pattern"] == BORDER_PATTERN

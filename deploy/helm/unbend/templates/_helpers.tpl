@@ -44,7 +44,8 @@ app.kubernetes.io/instance: {{ .Release.Name }}
   "UNBEND_DECODERS" (toString $cores)
   "UNBEND_ESTIMATOR_THREADS" (toString $cores)
   "UNBEND_PICTURES_BYTES" (div $processes 4 | toString)
-  "UNBEND_BODIES_BYTES" (div $processes 8 | toString)
+  "UNBEND_BODIES_BYTES" (div $processes 16 | toString)
+  "UNBEND_STREAM_FRAMES_BYTES" (div $processes 16 | toString)
   "UNBEND_DECODE_MEMORY_BYTES" (div (mul $processes 3) (mul $cores 8) | toString)
   "UNBEND_ROLE" $c.role
   "UNBEND_DRAIN_NOTICE_S" "0"

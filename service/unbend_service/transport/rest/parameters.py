@@ -8,7 +8,7 @@ from fastapi import Path, Query, Request
 from pydantic import WithJsonSchema
 
 from unbend_service.domain.errors import InvalidOption
-from unbend_service.domain.frames import BORDERS_ALLOWED
+from unbend_service.domain.frames import BORDER_PATTERN, BORDERS_ALLOWED
 from unbend_service.domain.records import Correct
 
 CorrectQuery = Annotated[
@@ -46,7 +46,9 @@ ConfidenceQuery = Annotated[
     ),
 ]
 BorderQuery = Annotated[
-    str, Query(max_length=16, description=f"What is painted where there is no picture: {BORDERS_ALLOWED}.")
+    str,
+    WithJsonSchema({"type": "string", "maxLength": 16, "pattern": BORDER_PATTERN}),
+    Query(max_length=16, description=f"What is painted where there is no picture: {BORDERS_ALLOWED}."),
 ]
 QualityQuery = Annotated[
     int | None,
