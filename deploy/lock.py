@@ -26,6 +26,8 @@ MACHINES = ("x86_64", "aarch64")
 PYTHONS = ("3.11", "3.13")
 #: Have no wheel for aarch64: there they are built, from sources that are known by their hash.
 BUILT = ("glcontext", "moderngl")
+#: Wanted by Pythons before 3.11.3, such as Debian 12's; pip asks such conditions of the Python that it runs in.
+ALSO = {"redis": ("async-timeout>=4.0.3",)}
 #: Newest first: pip takes what it is told, and no older tag by itself.
 GLIBCS = ("manylinux_2_34", "manylinux_2_28", "manylinux_2_27", "manylinux_2_24", "manylinux_2_17", "manylinux2014")
 #: Builds the distribution, and what is BUILT.
@@ -53,7 +55,7 @@ def wanted(extras: Iterable[str] = EXTRAS) -> list[str]:
     """The requirements of the distribution and of ``extras``. Raises KeyError: there is no such extra."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     optional: dict[str, list[str]] = project["optional-dependencies"]
-    return [*project["dependencies"], *(one for extra in extras for one in optional[extra])]
+    return [*project["dependencies"], *(one for extra in extras for one in (*optional[extra], *ALSO.get(extra, ())))]
 
 
 def resolve(requirements: Sequence[str], python: str) -> list[tuple[str, str, str]]:
