@@ -51,7 +51,33 @@ class Addresses:
 
 
 class _HttpServer(uvicorn.Server):
-    """Uvicorn without its own signal handling: the process drains both transports together."""
+    """Uvicorn without its own signal handling: the process drains both transports together.
+
+    Args:
+        handshake_s: longest wait for a TLS handshake, for which uvicorn has no setting.
+    """
+
+    def __init__(self, config: uvicorn.Config, handshake_s: float) -> None:
+        super().__init__(config)
+        self._handshake_s = handshake_s
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """As uvicorn's, for sockets that are bound already and an application without a lifespan."""
+        config, loop = self.config, asyncio.get_running_loop()
+        protocol: Any = config.http_protocol_class
+
+        def connected() -> asyncio.Protocol:
+            made: asyncio.Protocol = protocol(config=config, server_state=self.server_state, app_state={}, _loop=loop)
+            return made
+
+        limit_s = None if config.ssl is None else self._handshake_s
+        self.servers = [
+            await loop.create_server(
+                connected, sock=bound, backlog=config.backlog, ssl=config.ssl, ssl_handshake_timeout=limit_s
+            )
+            for bound in sockets or ()
+        ]
+        self.started = True
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -157,7 +183,8 @@ def _http_server(app: FastAPI, settings: Settings, context: ssl.SSLContext | Non
             server_header=False,
             timeout_graceful_shutdown=_LAST_BYTES_S,
             ssl_context_factory=None if context is None else lambda config, default: context,
-        )
+        ),
+        settings.handshake_s,
     )
 
 

@@ -136,6 +136,9 @@ class Settings(BaseSettings):
         2 << 30, ge=1 << 20, description="Memory of all decoded images together; one more is refused with 429."
     )
 
+    handshake_s: float = Field(
+        10.0, gt=0, description="Longest wait for a TLS handshake, and for the first word of a gRPC client."
+    )
     http_connections: int = Field(1024, ge=1, description="HTTP connections that may be open at once.")
     http_header_bytes: int = Field(64 << 10, ge=1024, description="Largest request line and headers; more gets 431.")
     http_header_s: float = Field(10.0, gt=0, description="Longest wait for a request line and headers.")

@@ -10,6 +10,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -95,6 +96,7 @@ def locked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Locked]:
         tls_client_ca=str(client.ca),
         tls_required="true",
         ops_port="0",
+        handshake_s="3",
     )
     yield Locked(server, here, client, stranger)
     assert stop_server(server) == 0
@@ -131,6 +133,24 @@ def test_a_client_without_a_certificate_or_with_a_strangers_is_refused(locked: L
         client = unbend.Client(locked.server.grpc, timeout_s=3, retries=0, ca_file=locked.here.ca, **files)
         with client, pytest.raises((unbend.Unreachable, unbend.DeadlineExceeded)):
             client.estimate(b"nothing")
+
+
+def test_a_client_who_connects_and_says_nothing_is_dropped_by_every_listener(locked: Locked) -> None:
+    """It keeps a descriptor for as long as a handshake may take, and no longer."""
+    silent = [
+        socket.create_connection((address.rpartition(":")[0], int(address.rpartition(":")[2])), timeout=20)
+        for address in (locked.server.http, locked.server.ops, locked.server.grpc)
+    ]
+    for connection in silent:
+        with connection, suppress(ConnectionError):
+            while connection.recv(4096):  # gRPC sends its settings first
+                pass
+
+
+def test_browsers_are_told_to_come_over_tls_only(locked: Locked) -> None:
+    address = f"https://{locked.server.http}/"
+    with urllib.request.urlopen(address, timeout=10, context=locked.context(locked.client)) as answer:
+        assert answer.headers["Strict-Transport-Security"] == "max-age=31536000"
 
 
 def test_a_client_with_a_certificate_is_served(locked: Locked) -> None:

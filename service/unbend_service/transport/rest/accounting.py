@@ -19,6 +19,8 @@ _ACCEPTED_ID = re.compile(r"[A-Za-z0-9._:-]{1,128}")
 _KNOWN_METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "DELETE", "OPTIONS", "PATCH"})
 #: Probes and scrapes come every few seconds; they are logged at debug level only.
 _QUIET_PATHS = frozenset({"/livez", "/readyz", "/metrics"})
+#: For how long browsers that came over TLS once never come without it.
+_ONE_YEAR = "max-age=31536000"
 
 _log = structlog.get_logger("unbend.http")
 
@@ -52,6 +54,8 @@ class Accounting:
                 headers[REQUEST_ID_HEADER] = request_id
                 headers["X-Content-Type-Options"] = "nosniff"
                 headers["Cross-Origin-Resource-Policy"] = "same-origin"
+                if scope.get("scheme") == "https":
+                    headers["Strict-Transport-Security"] = _ONE_YEAR
             await send(message)
 
         traceparent = Headers(scope=scope).get("traceparent")

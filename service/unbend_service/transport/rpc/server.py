@@ -45,6 +45,7 @@ def server_options(settings: Settings) -> list[tuple[str, int]]:
         ("grpc.keepalive_permit_without_calls", 1),
         ("grpc.http2.min_ping_interval_without_data_ms", 10_000),  # clients may ping as often as ours does
         ("grpc.http2.max_ping_strikes", 3),
+        ("grpc.server_handshake_timeout_ms", round(1000 * settings.handshake_s)),
         ("grpc.max_metadata_size", settings.grpc_metadata_bytes),
         ("grpc.absolute_max_metadata_size", 2 * settings.grpc_metadata_bytes),  # between the two refusal is by chance
         ("grpc.max_concurrent_streams", settings.grpc_calls),  # of one connection
