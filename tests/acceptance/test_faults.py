@@ -6,6 +6,7 @@ import ast
 import http.client
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,8 +14,11 @@ from pathlib import Path
 
 import cv2
 import grpc
+import numpy as np
+import psutil
 import pytest
 
+import unbend
 import unbend_service
 from tests.acceptance.conftest import Server, start_server, stop_server
 from tests.acceptance.test_endings import eventually
@@ -90,6 +94,71 @@ def test_a_client_killed_in_the_middle_of_a_stream_leaves_nothing_open(server: S
                 client.kill()
     assert eventually(lambda: server.metric("unbend_streams_active") == 0)
     assert eventually(lambda: active(server) == 0)
+
+
+@pytest.fixture(scope="module")
+def impatient() -> Iterator[Server]:
+    """A service that gives a stream up in which nothing moves for three seconds."""
+    server = start_server(workers="1", stream_idle_s="3")
+    yield server
+    assert stop_server(server) == 0
+
+
+def held_bytes(server: Server) -> int:
+    """Memory of the parent, frames in shared memory included."""
+    return int(psutil.Process(server.process.pid).memory_info().rss)
+
+
+def answered(server: Server, frames: int) -> list[int]:
+    """The indices that a stream of small frames is answered with."""
+    with unbend.Client(server.grpc) as client, client.stream(64, 48, "gray8") as stream:
+        return [result.index for result in stream.correct(np.zeros((48, 64), np.uint8) for _ in range(frames))]
+
+
+def test_who_does_not_read_bounds_his_own_memory_only(impatient: Server) -> None:
+    """His frames are read no further, other streams are answered meanwhile, and in the end he is given up."""
+    answered(impatient, 30)
+    before_bytes = held_bytes(impatient)
+    sent = 0
+
+    def requests() -> Iterator[correction_pb2.CorrectStreamRequest]:
+        nonlocal sent
+        layout = frame_pb2.FrameFormat(pixel_format=frame_pb2.PIXEL_FORMAT_RGB24, width=1280, height=720)
+        yield correction_pb2.CorrectStreamRequest(open=correction_pb2.StreamOpen(format=layout))
+        for index in range(1000):
+            sent += 1
+            frame = correction_pb2.StreamFrame(index=index, data=bytes(1280 * 720 * 3))
+            yield correction_pb2.CorrectStreamRequest(frame=frame)
+
+    options = [("grpc.max_send_message_length", -1), ("grpc.http2.bdp_probe", 0)]
+    with grpc.insecure_channel(impatient.grpc, options) as channel:
+        call = correction_pb2_grpc.CorrectionServiceStub(channel).CorrectStream(requests())
+        assert eventually(lambda: sent >= 8)
+        assert answered(impatient, 60) == list(range(60))
+        assert impatient.metric("unbend_streams_active") == 1
+        assert sent < 40
+        assert held_bytes(impatient) - before_bytes < 128 << 20  # 1000 frames of his take twenty times as much
+        assert eventually(lambda: impatient.metric("unbend_streams_active") == 0)
+        call.cancel()
+    assert eventually(lambda: active(impatient) == 0)
+
+
+def test_a_client_who_falls_silent_without_a_word_is_given_up(impatient: Server) -> None:
+    """Its connection stands, as that of a machine that lost its network does: the stream ends, others go on."""
+    with subprocess.Popen(
+        [sys.executable, "-c", STREAM, impatient.grpc], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    ) as client:
+        assert client.stdout is not None
+        for line in client.stdout:
+            if int(line) >= 20:
+                break
+        client.send_signal(signal.SIGSTOP)
+        try:
+            assert answered(impatient, 30) == list(range(30))
+            assert eventually(lambda: impatient.metric("unbend_streams_active") == 0)
+            assert eventually(lambda: active(impatient) == 0)
+        finally:
+            client.kill()
 
 
 def test_a_full_dev_shm_costs_nothing() -> None:
