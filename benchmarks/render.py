@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import fcntl
 import itertools
-from collections.abc import Callable
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import cv2
 import moderngl
@@ -17,7 +21,7 @@ from unbend_service.adapters.cores import usable_cores
 from unbend_service.adapters.metrics.prometheus import PrometheusMeter
 from unbend_service.adapters.renderers.mesh import mesh_triangles, mesh_vertices
 from unbend_service.adapters.renderers.pool import WorkerPool
-from unbend_service.application.ports import Bytes
+from unbend_service.application.ports import Bytes, SharedPicture
 from unbend_service.domain.errors import RendererUnavailable
 from unbend_service.domain.frames import BLACK, Frame, PixelFormat
 from unbend_service.domain.grid import Grid
@@ -50,16 +54,31 @@ class Pool:
         info = self._pool.state().renderer
         return info.device if info is not None else "unknown"
 
-    def one(self, frame: Frame, grid: Grid) -> None:
-        """One frame, alone in the pool."""
-        self._runner.run(self._render(frame, grid))
+    def one(self, frame: Frame, grid: Grid, shared: SharedPicture | None = None) -> float:
+        """One frame, alone in the pool; seconds until its answer, as seen on the event loop, where the service is."""
+        return self._runner.run(self._render(frame, grid, shared))
+
+    def shared(self, batch: list[Frame]) -> Iterator[tuple[Frame, SharedPicture]]:
+        """The frames, copied into memory that this process shares with the pool, and room for an answer to each."""
+        size = batch[0].data.size
+        fd = os.memfd_create("benchmark", os.MFD_ALLOW_SEALING)
+        os.ftruncate(fd, 2 * len(batch) * size)
+        fcntl.fcntl(fd, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)
+        memory = self._pool.adopt(fd, 2 * len(batch) * size)
+        for n, frame in enumerate(batch):
+            first, middle, end = (size * (2 * n + k) for k in range(3))
+            source, target = memory.memory[first:middle], memory.memory[middle:end]
+            source[:] = frame.data
+            yield replace(frame, data=source), SharedPicture(memory, first, middle, source, target)
 
     def many(self, batch: list[Frame], grid: Grid, in_flight: int = IN_FLIGHT) -> None:
         """All frames, ``in_flight`` at a time."""
         self._runner.run(self._flow(batch, grid, in_flight))
 
-    async def _render(self, frame: Frame, grid: Grid) -> None:
-        await self._pool.render(frame, grid, BLACK)
+    async def _render(self, frame: Frame, grid: Grid, shared: SharedPicture | None) -> float:
+        start = time.perf_counter()
+        await self._pool.render(frame, grid, BLACK, shared=shared)
+        return time.perf_counter() - start
 
     async def _flow(self, batch: list[Frame], grid: Grid, in_flight: int) -> None:
         waiting = iter(batch)
@@ -138,6 +157,18 @@ def _cpu(report: Report, runs: int, quick: bool) -> None:
             report.add_pair(name, pair, peer_name="cv2.remap", threads=cores, paper_k80_us=k80_us)
             if (width, height) in BARRED:
                 report.add_ratio(f"{name} / cv2.remap", pair.ratio, at_most=BAR)
+        for (width, height), pixel_format in itertools.product(sizes[:1] if quick else BARRED, FORMATS[:2]):
+            batch = frames(pixel_format, width, height, FRAMES)
+            bare = BareRemap(batch[0], grid)
+            source, lying = itertools.cycle(batch), itertools.cycle(pool.shared(batch))
+            pair = by_turns(
+                lambda lying=lying: pool.one((there := next(lying))[0], grid, there[1]),  # type: ignore[misc]  # mypy cannot infer a bound argument
+                lambda source=source, bare=bare: bare(next(source)),  # type: ignore[misc]  # as above
+                runs,
+            )
+            name = f"cpu pool, one frame at a time, {pixel_format} {width}x{height} in shared memory"
+            report.add_pair(name, pair, peer_name="cv2.remap", threads=cores)
+            report.add_ratio(f"{name} / cv2.remap", pair.ratio, at_most=BAR)
         for width, height in () if quick else BARRED:
             packed, wide = (frames(kind, width, height, FRAMES) for kind in (PixelFormat.RGB24, PixelFormat.RGBA))
             three, four = _each(packed, grid, pool.one), _each(wide, grid, pool.one)
@@ -190,7 +221,7 @@ def _egl(report: Report, runs: int, quick: bool) -> None:
 
 
 def _cases(
-    pixel_format: PixelFormat, width: int, height: int, grid: Grid, render: Callable[[Frame, Grid], None]
+    pixel_format: PixelFormat, width: int, height: int, grid: Grid, render: Callable[[Frame, Grid], object]
 ) -> tuple[Callable[[], object], Callable[[], object]]:
     """One frame through ``render``, and the next one through bare remap."""
     batch = frames(pixel_format, width, height, FRAMES)
@@ -199,6 +230,6 @@ def _cases(
     return _each(batch, grid, render), lambda: bare(next(source))
 
 
-def _each(batch: list[Frame], grid: Grid, render: Callable[[Frame, Grid], None]) -> Callable[[], object]:
+def _each(batch: list[Frame], grid: Grid, render: Callable[[Frame, Grid], object]) -> Callable[[], object]:
     source = itertools.cycle(batch)
     return lambda: render(next(source), grid)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import time
 from dataclasses import asdict
 
 import numpy as np
@@ -46,10 +45,9 @@ def _sizes(report: Report, pool: Pool, sizes: tuple[tuple[int, int], ...], runs:
         batch = itertools.cycle(frames(PixelFormat.I420, width, height, 2))
         seconds = []
         for turn in range(runs + 2):
-            start = time.perf_counter()
-            pool.one(next(batch), grid)
+            taken_s = pool.one(next(batch), grid)
             if turn >= 2:
-                seconds.append(time.perf_counter() - start)
+                seconds.append(taken_s)
         timing = Timing.of(seconds)
         per_pixel[width, height] = timing.median_s / (width * height)
         per_megapixel_ms = per_pixel[width, height] * 1e9
@@ -70,11 +68,8 @@ def _grids(report: Report, pool: Pool, count: int) -> None:
     grids = [barrel_grid(strength) for strength in np.linspace(0.05, 0.3, count)]
     for grid in grids[: min(count, 200)]:
         pool.one(batch[0], grid)
-    seconds = []
-    for number in random.integers(0, count, 200):
-        start = time.perf_counter()
-        pool.one(batch[number % len(batch)], grids[number])
-        seconds.append(time.perf_counter() - start)
+    numbers = random.integers(0, count, 200)
+    seconds = [pool.one(batch[number % len(batch)], grids[number]) for number in numbers]
     workers = psutil.Process().children()
     rss_mib = sum(worker.memory_info().rss for worker in workers) / 2**20
     timing, p99_s = Timing.of(seconds), float(np.quantile(seconds, 0.99))

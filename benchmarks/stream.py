@@ -9,7 +9,7 @@ import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from typing import Any
 import cv2
 import grpc
 import numpy as np
+import psutil
 import simplejpeg
 
 import unbend
@@ -58,6 +59,7 @@ def run(arguments: argparse.Namespace) -> Report:
         _shared(report, service, f"{folder}/frames.sock", grid, runs, count)
         _raw(report, service, grid, runs, count)
         _jpeg(report, service, grid, runs, count)
+        _spent(report, service, f"{folder}/frames.sock", grid, count)
         for streams in (2,) if arguments.quick else arguments.streams:
             _together(report, service, grid, streams, max(2, count // streams))
     return report
@@ -166,6 +168,54 @@ def _jpeg(report: Report, service: Served, grid: Grid, runs: int, count: int) ->
         cv2.setNumThreads(usable_cores())
     _add(report, "jpeg 1080p stream over gRPC", pair.per(count), "decode, remap, encode in one process, all cores")
     report.add_ratio("jpeg stream / in process, frames/s", 1 / pair.ratio, at_least=BAR_JPEG)
+
+
+def _spent(report: Report, service: Served, socket: str, grid: Grid, count: int) -> None:
+    """Where the processor time of a frame goes: of each party, for each way that frames take, and for the echo."""
+    arrays = [frame.data.reshape(HEIGHT * 3 // 2, WIDTH) for frame in frames(PixelFormat.I420, WIDTH, HEIGHT, DISTINCT)]
+    files = [jpeg(photograph(WIDTH, HEIGHT, seed)) for seed in range(4)]
+    parties = {"client": [psutil.Process()], "service": [psutil.Process(service.pid)], "workers": [], "decoders": []}
+    for child in parties["service"][0].children():
+        parties["workers" if any("renderers.worker" in part for part in child.cmdline()) else "decoders"].append(child)
+    with (
+        unbend.Client(service.grpc, shared_memory=socket) as sharing,
+        unbend.Client(service.grpc) as client,
+        echo_served() as address,
+        open_channel(address, None) as channel,
+    ):
+        record = client.grids.put(unbend.Grid(grid.source))
+
+        def raw(face: unbend.Client) -> None:
+            with face.stream(WIDTH, HEIGHT, "i420", grid=record, fit="keep", in_flight=IN_FLIGHT) as stream:
+                _drain(stream.correct(arrays[n % DISTINCT] for n in range(count)), count)
+
+        def encoded() -> None:
+            with client.stream(pixel_format="jpeg", grid=record, fit="keep", in_flight=IN_FLIGHT) as stream:
+                _drain(stream.correct(files[n % len(files)] for n in range(count)), count)
+
+        echo = {"client": parties["client"], "echo": [p for p in psutil.Process().children() if p.pid != service.pid]}
+        cases: list[tuple[str, dict[str, list[psutil.Process]], Callable[[], None]]] = [
+            ("bare gRPC echo", echo, lambda: _echo(channel, arrays, count)),
+            ("raw i420 stream over gRPC", parties, lambda: raw(client)),
+            ("raw i420 stream over shared memory", parties, lambda: raw(sharing)),
+            ("jpeg 1080p stream over gRPC", parties, encoded),
+        ]
+        for name, those, work in cases:
+            work()
+            before = {party: _cpu_s(processes) for party, processes in those.items()}
+            start = time.perf_counter()
+            work()
+            wall_ms = (time.perf_counter() - start) / count * 1e3
+            spent = {f"{p}_cpu_ms": (_cpu_s(those[p]) - cpu_s) / count * 1e3 for p, cpu_s in before.items()}
+            least_ms = sum(spent.values()) / usable_cores()
+            row = {"name": f"{name}: processor time a frame", **spent, "least_ms": least_ms, "wall_ms": wall_ms}
+            report.rows.append(row)
+            parts = ", ".join(f"{party} {value:.1f}" for party, value in row.items() if party != "name")
+            print(f"{row['name']}: {parts}", flush=True)
+
+
+def _cpu_s(processes: list[psutil.Process]) -> float:
+    return sum(sum(process.cpu_times()[:2]) for process in processes)
 
 
 def _together(report: Report, service: Served, grid: Grid, streams: int, count: int) -> None:

@@ -7,6 +7,8 @@ import signal
 import time
 from pathlib import Path
 
+import cv2
+
 from unbend_service.adapters.renderers.cpu import CpuRenderer
 from unbend_service.adapters.renderers.selection import RendererOptions
 from unbend_service.application.ports import Bytes, RendererInfo
@@ -14,12 +16,12 @@ from unbend_service.domain.errors import RendererUnavailable
 from unbend_service.domain.frames import Border, Frame
 from unbend_service.domain.grid import Grid
 
-DRAW, SLEEP, CRASH, KILLED_TWICE, KILLED, HANG, RAISE, WHO, STOPPED_ONCE, LOST, LOST_ONCE = range(11)
+DRAW, SLEEP, CRASH, KILLED_TWICE, KILLED, HANG, RAISE, WHO, STOPPED_ONCE, LOST, LOST_ONCE, THREADS = range(12)
 SLEEP_S = 0.5
 
 
 class MisbehavingRenderer:
-    """Answers WHO with the number of its process in the first four bytes."""
+    """Answers WHO with the number of its process in the first four bytes, THREADS with those of OpenCV in the first."""
 
     def __init__(self) -> None:
         self._renderer = CpuRenderer()
@@ -48,6 +50,8 @@ class MisbehavingRenderer:
         elif order == WHO:
             time.sleep(0.02)
             target[:4] = list(os.getpid().to_bytes(4))
+        elif order == THREADS:
+            target[0] = cv2.getNumThreads()
 
     def rest(self) -> None:
         self._renderer.rest()

@@ -39,6 +39,16 @@ def test_maps_that_would_fill_the_cache_are_not_kept(pixel_format: PixelFormat) 
     assert small.kept_bytes == 0
 
 
+def test_of_maps_that_would_fill_the_cache_a_part_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What of a huge frame's maps fits into half of the cache need not be made again, and nobody can tell."""
+    monkeypatch.setattr(sampling, "STRIP_SAMPLES", 203 * 7)
+    source, cache_bytes = frame(PixelFormat.RGB24), 8 * 203 * 151
+    whole, small = CpuRenderer(), CpuRenderer(cache_bytes)
+    for _ in range(2):
+        np.testing.assert_array_equal(rendered(small, source), rendered(whole, source))
+        assert cache_bytes // 4 < small.kept_bytes <= cache_bytes // 2
+
+
 def test_maps_are_shared_by_planes_and_formats_of_one_size() -> None:
     """A second frame of a grid and size costs no new maps, whatever its colours."""
     renderer = CpuRenderer()

@@ -63,6 +63,20 @@ async def test_frames_of_all_sizes_and_grids_come_back_rendered(make_pool: MakeP
     assert meter.restarts == {}
 
 
+async def test_a_frame_that_is_alone_has_every_core(make_pool: MakePool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A large picture does not wait for one core while the others rest; frames side by side share them."""
+    monkeypatch.setattr("unbend_service.adapters.renderers.pool.usable_cores", lambda: 2)
+    pool = await make_pool(workers=2)
+    large, small = frame(misbehaving.THREADS, width=1280, height=720), frame(misbehaving.THREADS)
+
+    async def threads(source: Frame) -> int:
+        return int((await pool.render(source, GRID, BLACK))[0])
+
+    assert [await threads(large), await threads(small), await threads(large)] == [2, 1, 2]
+    together = await asyncio.gather(*(threads(large) for _ in range(4)))
+    assert together.count(1) >= 3  # the last may be alone when it is its turn
+
+
 async def test_a_killed_worker_loses_no_frame(make_pool: MakePool, meter: RecordingMeter) -> None:
     """kill -9 in the middle of the work: every frame arrives, right and once, and the worker is replaced."""
     pool = await make_pool(workers=2)

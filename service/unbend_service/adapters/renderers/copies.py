@@ -10,8 +10,8 @@ import numpy as np
 
 from unbend_service.application.ports import Bytes
 
-#: A smaller copy takes less time than handing it to a thread.
-_INLINE_BYTES = 256 << 10
+#: A smaller copy takes less time than handing it to a thread, which has to be woken and to wake the event loop.
+_INLINE_BYTES = 1 << 20
 
 
 class Copies:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain, islice
 
 import cv2
 import numpy as np
@@ -17,8 +18,6 @@ from unbend_service.domain.grid import Grid
 
 #: cv2.remap keeps positions in 16 bits.
 _LONGEST_PX = 32_766
-#: Bytes of maps per sample at most: two float32 positions and a byte of mask.
-_STRIP_BYTES = 9
 #: A packed 3-channel plane up to this size goes through RGBA, which cv2.remap samples three times as fast.
 _WIDENED_BYTES = 64 << 20
 #: The border is painted from a block of so many rows, which stays in the cache of the processor.
@@ -40,10 +39,11 @@ class _Strip:
         return self.map_x.nbytes + self.map_y.nbytes + (0 if self.outside is None else self.outside.nbytes)
 
 
-def _make_strips(grid: Grid, sampling: PlaneSampling) -> Iterator[_Strip]:
+def _make_strips(grid: Grid, sampling: PlaneSampling, skipped: int = 0) -> Iterator[_Strip]:
+    """The strips of a plane but the first few."""
     inside = sampling.shows_only_source(grid)
     low, (high_x, high_y) = sampling.valid_low, sampling.valid_high
-    for first, end in sampling.strips():
+    for first, end in islice(sampling.strips(), skipped, None):
         map_x, map_y = sampling.source_maps(grid, first, end)
         outside = None
         if not inside:
@@ -71,6 +71,7 @@ class CpuRenderer:
         self._cache_bytes = cache_bytes
         self._maps: Recent[tuple[str, PlaneSampling], tuple[_Strip, ...]] = Recent(cache_bytes)
         self._wide: tuple[Bytes, Bytes] | None = None
+        self._split: tuple[Bytes, ...] | None = None
 
     @property
     def info(self) -> RendererInfo:
@@ -101,21 +102,28 @@ class CpuRenderer:
                 strips = self._strips(grid, PlaneSampling.of(source, plane))
                 if plane.channels == 3 and plane.size_bytes <= _WIDENED_BYTES:
                     self._draw_widened(samples, strips, colour, drawn)
+                elif plane.channels == 2:
+                    self._draw_split(samples, strips, colour, drawn)
                 else:
                     _draw(samples, strips, colour, drawn)
         except cv2.error as error:
             raise RenderFailed(f"OpenCV could not render the frame: {error}") from error
 
     def _strips(self, grid: Grid, sampling: PlaneSampling) -> Iterable[_Strip]:
-        """The maps of a plane; those of one so large that it would crowd out the others are not kept."""
+        """The maps of a plane. Of one so large that it would crowd out the others the first strips alone are kept."""
         key = grid.id, sampling
         kept = self._maps.get(key)
-        if kept is not None:
-            return kept
-        if _STRIP_BYTES * sampling.width * sampling.height > self._cache_bytes // 2:
-            return _make_strips(grid, sampling)
-        made = tuple(_make_strips(grid, sampling))
-        return self._maps.put(key, made, sum(strip.size_bytes for strip in made))
+        if kept is None:
+            kept, kept_bytes = (), 0
+            for strip in _make_strips(grid, sampling):
+                kept_bytes += strip.size_bytes
+                if kept_bytes > self._cache_bytes // 2:
+                    break
+                kept += (strip,)
+            if kept:
+                self._maps.put(key, kept, sum(strip.size_bytes for strip in kept))
+        whole = kept and kept[-1].end == sampling.height
+        return kept if whole else chain(kept, _make_strips(grid, sampling, len(kept)))
 
     def _draw_widened(self, samples: Bytes, strips: Iterable[_Strip], colour: tuple[int, ...], drawn: Bytes) -> None:
         shape = (*samples.shape[:2], 4)
@@ -126,9 +134,21 @@ class CpuRenderer:
         _draw(wide, strips, (*colour, 255), wide_drawn)
         cv2.cvtColor(wide_drawn, cv2.COLOR_RGBA2RGB, dst=drawn)
 
+    def _draw_split(self, samples: Bytes, strips: Iterable[_Strip], colour: tuple[int, ...], drawn: Bytes) -> None:
+        """Channel by channel: cv2.remap takes longer for two that are packed, and places them on a coarser raster."""
+        shape = samples.shape[:2]
+        if self._split is None or self._split[0].shape != shape:
+            self._split = tuple(np.empty(shape, np.uint8) for _ in range(4))
+        sources, targets = self._split[:2], self._split[2:]
+        cv2.split(samples, sources)
+        for strip in strips:
+            for source, target, level in zip(sources, targets, colour, strict=True):
+                _draw(source, (strip,), (level,), target)
+        cv2.merge(targets, dst=drawn)
+
     def rest(self) -> None:
         """See :class:`~unbend_service.application.ports.Renderer`; the maps stay."""
-        self._wide = None
+        self._wide = self._split = None
 
     def close(self) -> None:
         self._maps.clear()

@@ -36,6 +36,7 @@ class Job:
         copied: whether the source is in the slot, or need not be.
         blame: grows with every worker that dies while it renders this very frame.
         context: of the caller, so that what is measured counts as his.
+        threads: of the processor that it may use.
         passed_over: how often a later frame was taken first because it suited the worker.
         turn: its place in the queue, see JobQueue.
     """
@@ -54,6 +55,7 @@ class Job:
     slot: Slot | None = None
     copied: bool = False
     blame: int = 0
+    threads: int = 1
     passed_over: int = 0
     turn: int = 0
     context: Context = field(default_factory=copy_context)

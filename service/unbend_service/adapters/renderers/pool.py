@@ -41,6 +41,8 @@ _WORKERS_OF_A_GPU = 4
 #: Two crashes or hangs make a frame poison. A SIGKILL comes from outside and says less of the frame, unless it comes
 #: every time.
 _BLAME_OF_A_CRASH, _BLAME_OF_A_KILL, _BLAME_OF_POISON = 2, 1, 4
+#: A frame that is alone may use so many cores, if it is worth their waking.
+_MOST_THREADS, _WORTH_THREADS_BYTES = 8, 1 << 20
 _METER_INTERVAL_S = 0.1
 #: Memory for frames is given back once no frame came for so long.
 _REST_S = 10.0
@@ -84,6 +86,7 @@ class WorkerPool:
             egl_device=settings.egl_device,
             map_cache_bytes=settings.map_cache_bytes,
         )
+        self._threads = options.threads
         self._quarantine = Quarantine()
         hang_s = min(settings.hang_s, settings.render_deadline_s)
         self._supervisor = Supervisor(renderer_factory, options, hang_s, self)
@@ -313,7 +316,7 @@ class WorkerPool:
         if not job.copied or (job.shared is not None and not job.blame):
             job.context.run(self._meter.stage, "queue", asyncio.get_running_loop().time() - job.accepted_s)
         if job.copied:
-            self._supervisor.send(job, worker)
+            self._send(job, worker)
             return
         if job.slot is None:
             raise RuntimeError("a job without a slot was assigned")
@@ -322,7 +325,7 @@ class WorkerPool:
         def copied() -> None:
             job.copied = True
             if job in worker.held and not job.answer.done():
-                self._supervisor.send(job, worker)
+                self._send(job, worker)
                 return
             worker.held.discard(job)
             if job.answer.done():
@@ -332,6 +335,12 @@ class WorkerPool:
             self._dispatch()
 
         self._copies.copy(source, job.frame.data, copied)
+
+    def _send(self, job: Job, worker: WorkerProcess) -> None:
+        """Has a frame drawn that is where it has to be: with its worker's share of the cores, or all if it is alone."""
+        alone = len(self._jobs) == 1 and job.size_bytes >= _WORTH_THREADS_BYTES
+        job.threads = max(self._threads, min(self._cores, _MOST_THREADS)) if alone else self._threads
+        self._supervisor.send(job, worker)
 
     def _copy_out(self, job: Job) -> None:
         if job.answer.done() or job.slot is None:

@@ -95,21 +95,21 @@ class PlaneSampling:
         lattice = self.displacement(grid)[row[0] : row[-1] + 2]
         row -= row[0]
         bands = np.append(np.flatnonzero(np.diff(row, prepend=-1)), len(row))
-        own_y = np.arange(first, end, dtype=np.float32)[:, None]
+        # a row of the map is v * (bottom - top) + top + own: a product of matrices, which writes it in a single pass
+        weights = np.ones((end - first, 3), dtype=np.float32)
+        weights[:, 0] = v
+        terms = np.ones((3, self.width), dtype=np.float32)
         maps = []
-        for axis in range(2):
+        for axis, own in enumerate((np.arange(self.width), np.arange(first, end))):
             points = lattice[..., axis]
             across = points[:, column] * (1 - u) + points[:, column + 1] * u
-            if axis == 0:
-                across += np.arange(self.width, dtype=np.float32)
+            (terms[2], weights[:, 2]) = (own, 1) if axis == 0 else (1, own)
             dense = np.empty((end - first, self.width), dtype=np.float32)
-            # one band lies between two rows of the lattice, and is small enough to stay in the processor's cache
-            for start, stop in pairwise(bands):
-                top, bottom, band = across[row[start]], across[row[start] + 1], dense[start:stop]
-                np.multiply(v[start:stop, None], bottom - top, out=band)
-                band += top
-                if axis == 1:
-                    band += own_y[start:stop]
+            for start, stop in pairwise(bands):  # each lies between two rows of the lattice
+                top, bottom = across[row[start]], across[row[start] + 1]
+                np.subtract(bottom, top, out=terms[0])
+                terms[1] = top
+                np.matmul(weights[start:stop], terms, out=dense[start:stop])
             maps.append(dense)
         return maps[0], maps[1]
 

@@ -13,6 +13,7 @@ import signal
 import sys
 import time
 
+import cv2
 import numpy as np
 
 from unbend_service.adapters.renderers.channel import (
@@ -50,6 +51,7 @@ class Worker:
         self._slots: dict[int, Slot] = {}
         self._grids: dict[str, Grid] = {}
         self._failures = 0
+        self._threads = 0
 
     def serve(self) -> None:
         """Works until the renderer fails again and again.
@@ -96,6 +98,9 @@ class Worker:
             rows, columns = task.lattice
             lattice = self._part(task.lattice_place, rows * columns * 8)
             self._grids[task.grid_id] = Grid(lattice.view(np.float32).reshape(rows, columns, 2))
+        if task.threads != self._threads:
+            self._threads = task.threads
+            cv2.setNumThreads(task.threads)
         size_bytes = frame_size_bytes(task.pixel_format, task.width, task.height)
         source, target = self._part(task.source, size_bytes), self._part(task.target, size_bytes)
         source.flags.writeable = False

@@ -97,6 +97,7 @@ class WorkerProcess:
                 width=frame.width,
                 height=frame.height,
                 border=job.border,
+                threads=job.threads,
                 grid_id=job.grid.id,
                 lattice=None if known else (job.grid.rows, job.grid.columns),
                 lattice_place=Place(slot.number, job.lattice_offset),
