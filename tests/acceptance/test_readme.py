@@ -46,6 +46,16 @@ def test_the_configuration_tables_are_those_of_the_settings() -> None:
         assert with_table(page.read_text()) == page.read_text(), f"run `make docs`: {page.name}"
 
 
+def test_every_promise_names_what_shows_it() -> None:
+    (table,) = re.findall(r"^\| promise \| shown by \|\n\|---\|---\|\n((?:\|.*\n)+)", README.read_text(), re.MULTILINE)
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    for row in table.splitlines():
+        named = re.findall(r"`(make [a-z-]+|tests/[\w/.]+)`", row.split(" | ")[-1])
+        assert named, row
+        for one in named:
+            assert one.removeprefix("make ") in targets or (ROOT / one).exists(), one
+
+
 @pytest.mark.parametrize("page", [README, ROOT / "docs/accuracy.md"], ids=lambda page: page.name)
 def test_the_figures_are_those_of_the_model_that_is_used_by_default(page: Path) -> None:
     (figures,) = re.findall(r"^<!-- figures:.*?^<!-- /figures -->", page.read_text(), re.MULTILINE | re.DOTALL)
