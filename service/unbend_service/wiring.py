@@ -130,7 +130,8 @@ def build_service(settings: Settings) -> Service:
     """
     meter, tracer = build_meter(settings)
     access = build_access(settings, meter)
-    blocking = BlockingWork(usable_cores(), settings.queue_frames, meter)
+    cores = usable_cores()
+    blocking = BlockingWork(cores, settings.queue_frames, meter, waiting=settings.decoders or cores)
     decoders = DecoderPool(settings, meter)
     codec = IsolatedCodec(decoders, PillowCodec(settings))
     store = build_store(settings, meter)
@@ -144,7 +145,7 @@ def build_service(settings: Settings) -> Service:
         elsewhere = BlockingWork(REMOTE_ESTIMATES, settings.queue_frames, meter)
         estimator, closing = remote, (elsewhere.close, remote.close)
     else:
-        estimator = load_estimator(settings.model, settings.estimator_threads or usable_cores())
+        estimator = load_estimator(settings.model, settings.estimator_threads or cores)
     estimation = Estimation(
         estimator,
         codec,

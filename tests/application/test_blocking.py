@@ -40,3 +40,14 @@ async def test_an_error_reaches_the_caller_and_frees_its_place() -> None:
         with pytest.raises(ZeroDivisionError):
             await blocking.run("decode", divmod, 1, 0)
     blocking.close()
+
+
+async def test_who_waits_for_a_decoder_keeps_nobody_from_work() -> None:
+    """All decoders may be busy, and pictures that were decoded before are encoded all the same."""
+    blocking = BlockingWork(1, 8, RecordingMeter(), waiting=2)
+    gate = threading.Event()
+    held = [asyncio.create_task(blocking.run("decode", gate.wait)) for _ in range(4)]
+    assert await asyncio.wait_for(blocking.run("encode", lambda: "encoded"), 10) == "encoded"
+    gate.set()
+    assert await asyncio.gather(*held) == [True] * 4
+    blocking.close()

@@ -17,10 +17,20 @@ R = TypeVar("R")
 
 
 class BlockingWork:
-    """Runs functions in threads; refuses work once too much of it waits."""
+    """Runs functions in threads; refuses work once too much of it waits.
 
-    def __init__(self, threads: int, queue_length: int, meter: Meter) -> None:
+    Args:
+        threads: functions that run at once.
+        queue_length: functions that may wait.
+        waiting: threads besides for the stage ``decode``, which waits for other processes and keeps no core busy;
+            0: it has none of its own.
+    """
+
+    def __init__(self, threads: int, queue_length: int, meter: Meter, *, waiting: int = 0) -> None:
         self._executor = ThreadPoolExecutor(threads, thread_name_prefix="unbend-blocking")
+        self._waiting = self._executor
+        if waiting:
+            self._waiting = ThreadPoolExecutor(waiting, thread_name_prefix="unbend-waiting")
         self._bound = threads + queue_length
         self._pending = 0
         self._meter = meter
@@ -39,7 +49,8 @@ class BlockingWork:
         self._pending += 1
         context = copy_context()  # so that the duration counts as the caller's
         loop = asyncio.get_running_loop()
-        work = loop.run_in_executor(self._executor, context.run, self._timed, stage, function, args, kwargs)
+        executor = self._waiting if stage == "decode" else self._executor
+        work = loop.run_in_executor(executor, context.run, self._timed, stage, function, args, kwargs)
         work.add_done_callback(self._finished)
         return await work
 
@@ -55,4 +66,5 @@ class BlockingWork:
 
     def close(self) -> None:
         """Lets running calls end and forgets those that wait."""
-        self._executor.shutdown(wait=False, cancel_futures=True)
+        for executor in (self._executor, self._waiting):
+            executor.shutdown(wait=False, cancel_futures=True)
