@@ -39,8 +39,12 @@ setup-dev: $(VENV)/.dev  ## Make .venv with what tests and checks need
 serve: setup  ## Serve HTTP on 127.0.0.1:8080 and gRPC on 127.0.0.1:50051
 	$(BIN)/unbend serve
 
-test: setup-dev  ## Run the tests
-	$(BIN)/python -m pytest
+# A file at a time to each process, in the order of their names: servers that tests of a file share are started once
+JOBS ?= 2
+SHARED := -n $(JOBS) --dist loadfile --no-loadscope-reorder
+
+test: setup-dev  ## Run the tests in JOBS (2) processes
+	$(BIN)/python -m pytest $(SHARED)
 
 e2e: $(VENV)/.e2e  ## Drive the pages in Chromium; screenshots go to artifacts/
 	$(BIN)/python -m pytest -m e2e tests/e2e

@@ -15,7 +15,6 @@ from unbend_service.adapters.estimators.node_credentials import read_node_creden
 from unbend_service.adapters.estimators.remote import RemoteEstimator
 from unbend_service.adapters.exchange.files import ExchangeFiles
 from unbend_service.adapters.grid_stores.memory import MemoryGridStore
-from unbend_service.adapters.grid_stores.redis import RedisGridStore
 from unbend_service.adapters.grid_stores.sheltered import ShelteredGridStore
 from unbend_service.adapters.grid_stores.sqlite import SqliteGridStore
 from unbend_service.adapters.metrics.prometheus import PrometheusMeter
@@ -53,6 +52,9 @@ def build_store(settings: Settings, meter: Meter | None = None) -> GridStore:
     if settings.grid_store == "sqlite":
         return SqliteGridStore(settings)
     if settings.grid_store == "redis":
+        # a sixth of the time that a start takes, and most replicas need none
+        from unbend_service.adapters.grid_stores.redis import RedisGridStore
+
         meter = meter or PrometheusMeter()
         kept = settings.grid_store_local_entries
         return ShelteredGridStore(

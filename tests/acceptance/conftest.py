@@ -41,18 +41,22 @@ class Server:
             return bytes(answer.read())
 
     def workers(self) -> list[psutil.Process]:
-        """The render worker processes, as the log names them."""
+        """The render worker processes that live, as the log names them."""
         pids = {entry["pid"] for entry in self.lines if entry["event"] == "render worker ready"}
-        return [child for child in psutil.Process(self.process.pid).children(recursive=True) if child.pid in pids]
+        children = psutil.Process(self.process.pid).children(recursive=True)
+        return [child for child in children if child.pid in pids and child.status() != psutil.STATUS_ZOMBIE]
 
 
 def start_server(*, before: tuple[str, ...] = (), **settings: str) -> Server:
-    """Starts ``unbend serve`` and waits until it says that it is ready; ``before`` is a command that executes it."""
+    """Starts ``unbend serve`` and waits until it says that it is ready; ``before`` is a command that executes it.
+
+    It has one render worker and one decoder unless the settings say otherwise: each takes half a second to start.
+    """
     environment = os.environ | {
         "UNBEND_HTTP_PORT": "0",
         "UNBEND_GRPC_PORT": "0",
         "UNBEND_LOG_FORMAT": "json",
-        **{f"UNBEND_{name.upper()}": value for name, value in settings.items()},
+        **{f"UNBEND_{name.upper()}": value for name, value in ({"workers": "1", "decoders": "1"} | settings).items()},
     }
     process = subprocess.Popen(
         [*before, sys.executable, "-m", "unbend", "serve"], env=environment, stderr=subprocess.PIPE, text=True
@@ -95,9 +99,14 @@ def stop_server(server: Server) -> int:
         server.process.wait(5)
 
 
+def shared_memory_names() -> set[str]:
+    """Entries of /dev/shm, but for those that other programs have there meanwhile: Envoy's, and multiprocessing's."""
+    return {name for name in os.listdir("/dev/shm") if not name.startswith(("envoy_shared_memory", "sem.mp-"))}
+
+
 @pytest.fixture(scope="session")
 def server() -> Iterator[Server]:
     """One service for every test that does not need its own."""
-    running = start_server()
+    running = start_server(workers="2", decoders="2")
     yield running
     assert stop_server(running) == 0

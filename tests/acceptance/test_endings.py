@@ -17,7 +17,7 @@ import psutil
 import pytest
 
 import unbend
-from tests.acceptance.conftest import Server, start_server, stop_server
+from tests.acceptance.conftest import Server, shared_memory_names, start_server, stop_server
 from tests.acceptance.test_http import facade
 from unbend.v1 import correction_pb2, correction_pb2_grpc, frame_pb2
 
@@ -168,7 +168,7 @@ def test_a_second_signal_ends_the_service_at_once(first: signal.Signals) -> None
 
 def test_kill_9_of_the_service_leaves_nothing_behind(tmp_path: Path) -> None:
     """No worker, nothing in /dev/shm, nothing in the folder for temporary files; not even of a stopped worker."""
-    before = set(os.listdir("/dev/shm"))
+    before = shared_memory_names()
     os.environ["TMPDIR"], old = str(tmp_path), os.environ.get("TMPDIR")
     try:
         server = start_server(workers="2")
@@ -187,5 +187,5 @@ def test_kill_9_of_the_service_leaves_nothing_behind(tmp_path: Path) -> None:
     for thread in threads:
         thread.join(30)
     stop_server(server)
-    assert set(os.listdir("/dev/shm")) <= before
+    assert shared_memory_names() <= before
     assert list(tmp_path.iterdir()) == []

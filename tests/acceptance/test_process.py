@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import os
 import signal
 import threading
 import urllib.request
@@ -8,12 +7,12 @@ import urllib.request
 import cv2
 import pytest
 
-from tests.acceptance.conftest import start_server, stop_server
+from tests.acceptance.conftest import shared_memory_names, start_server, stop_server
 from tests.acceptance.test_http import facade
 
 
 def test_sigterm_finishes_what_was_accepted_and_leaves_nothing_in_shared_memory() -> None:
-    before = set(os.listdir("/dev/shm"))
+    before = shared_memory_names()
     server = start_server(workers="1")
     body = cv2.imencode(".png", facade(1920, 1080))[1].tobytes()
     statuses: list[int] = []
@@ -35,7 +34,7 @@ def test_sigterm_finishes_what_was_accepted_and_leaves_nothing_in_shared_memory(
     assert statuses == [200, 200, 200]
     assert server.process.wait(30) == 0
     stop_server(server)
-    assert set(os.listdir("/dev/shm")) <= before
+    assert shared_memory_names() <= before
 
 
 @pytest.mark.egl

@@ -110,6 +110,7 @@ def test_shell_snippets_work_as_they_stand(server: Server, tmp_path: Path, snipp
     # the doctor is to look at free ports, whatever else runs on this machine
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     environment = os.environ | {"UNBEND_HTTP_PORT": "0", "UNBEND_GRPC_PORT": "0", "PATH": path}
+    environment |= {"UNBEND_WORKERS": "1", "UNBEND_DECODERS": "1"}  # commands start services of their own
     subprocess.run(["bash", "-euc", ready], cwd=tmp_path, env=environment, check=True, timeout=120)
     for name in re.findall(r"-o ([\w.]+)", snippet):
         assert (tmp_path / name).stat().st_size > 0

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import unbend
-from tests.acceptance.conftest import Server, start_server, stop_server
+from tests.acceptance.conftest import Server, shared_memory_names, start_server, stop_server
 
 WIDTH, HEIGHT = 640, 360
 SHAPE = (HEIGHT * 3 // 2, WIDTH)
@@ -76,7 +76,7 @@ def test_frames_through_shared_memory_are_those_of_the_connection(local: tuple[S
 def test_of_a_client_that_is_killed_nothing_is_left(local: tuple[Server, Path]) -> None:
     """No descriptor, no mapping, nothing in /dev/shm; the service goes on."""
     server, path = local
-    before = set(os.listdir("/dev/shm"))
+    before = shared_memory_names()
     with subprocess.Popen(
         [sys.executable, "-c", ENDLESS, server.grpc, str(path)], stdout=subprocess.PIPE, text=True
     ) as process:
@@ -85,6 +85,6 @@ def test_of_a_client_that_is_killed_nothing_is_left(local: tuple[Server, Path]) 
         assert shared_memories(server)
         process.send_signal(signal.SIGKILL)
     until_none(server)
-    assert set(os.listdir("/dev/shm")) <= before
+    assert shared_memory_names() <= before
     with unbend.Client(server.grpc, shared_memory=path) as client, client.stream(WIDTH, HEIGHT, "i420") as stream:
         assert len(list(stream.correct([np.zeros(SHAPE, np.uint8)] * 10))) == 10

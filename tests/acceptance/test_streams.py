@@ -105,7 +105,7 @@ def test_a_worker_killed_in_the_middle_costs_no_frame(server: Server, video: Pat
             if result.index in (40, 90):
                 server.workers()[0].kill()
     assert indices == list(range(150))
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + 60  # so long only where other tests have the cores
     while server.metric("unbend_worker_restarts_total") < restarts + 2 and time.monotonic() < deadline:
         time.sleep(0.1)
     assert server.metric("unbend_worker_restarts_total") == restarts + 2

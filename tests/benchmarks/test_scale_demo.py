@@ -8,9 +8,12 @@ from benchmarks import scale_demo
 from tests.companions import started
 
 
-def test_streams_outlive_replicas_and_redis(capsys: pytest.CaptureFixture[str]) -> None:
+def test_streams_outlive_replicas_and_redis(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Two replicas behind HAProxy: one killed, both restarted, Redis away: no frame is lost, no grid changes."""
-    arguments = Namespace(step="all", proxy="haproxy", streams=8, rate=4.0, outage_s=5.0)
+    monkeypatch.setenv("UNBEND_DECODERS", "1")
+    arguments = Namespace(step="all", proxy="haproxy", streams=6, rate=4.0, outage_s=5.0)
     status = started(lambda: scale_demo.run(arguments))
     said = capsys.readouterr().out
     assert status == 0, said

@@ -19,6 +19,7 @@ def test_every_suite_runs_and_says_what_it_compared(
 ) -> None:
     """Each is one command, and its file names machine, commit, ratios with their bars, and every measurement."""
     file = tmp_path / f"{suite}.json"
+    monkeypatch.setenv("UNBEND_DECODERS", "1")
     monkeypatch.setattr("sys.argv", ["benchmarks", suite, "--quick", "--json", str(file)])
     assert main() == 0
     report = json.loads(file.read_text())

@@ -10,6 +10,13 @@ from unbend_service.domain.grid import Grid
 from unbend_service.domain.records import GridRecord
 
 
+@pytest.fixture(autouse=True)
+def small_services(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands start services of their own, dozens of them here: each process less is half a second."""
+    monkeypatch.setenv("UNBEND_WORKERS", "1")
+    monkeypatch.setenv("UNBEND_DECODERS", "1")
+
+
 @pytest.fixture
 def grid_file(tmp_path: Path) -> Path:
     """A barrel as JSON."""

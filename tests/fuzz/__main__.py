@@ -17,7 +17,7 @@ from tests.fuzz.campaign import run
 
 def main() -> int:
     count, seed = int(os.environ.get("FUZZ_N", "100000")), int(os.environ.get("FUZZ_SEED", "1"))
-    server = start_server(source_pixels="4000000")
+    server = start_server(workers="2", decoders="2", source_pixels="4000000")
     try:
         verdict = asyncio.run(run(server, count, seed, Path("artifacts/fuzz")))
         status = stop_server(server)

@@ -16,7 +16,7 @@ from tests.fuzz.sending import Senders
 
 @pytest.fixture(scope="module")
 def attacked() -> Iterator[Server]:
-    running = start_server(source_pixels="4000000")
+    running = start_server(workers="2", decoders="2", source_pixels="4000000")
     yield running
     assert stop_server(running) == 0
 
