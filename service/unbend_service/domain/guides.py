@@ -198,23 +198,24 @@ class Guides:
 
 def lagrange_basis(nodes: Float64, position: Float64) -> Float64:
     """(n, K) Lagrange basis polynomials over ``nodes`` (K,) at ``position`` (n,)."""
-    basis = np.ones((len(position), len(nodes)))
-    for i, node in enumerate(nodes):
-        for j, other in enumerate(nodes):
-            if i != j:
-                basis[:, i] *= (position - other) / (node - other)
-    return basis
+    apart = position[:, None] - nodes
+    below, above = np.ones_like(apart), np.ones_like(apart)
+    np.cumprod(apart[:, :-1], axis=1, out=below[:, 1:])
+    np.cumprod(apart[:, :0:-1], axis=1, out=above[:, -2::-1])
+    between = nodes[:, None] - nodes
+    np.fill_diagonal(between, 1.0)
+    return np.asarray(below * above / between.prod(axis=1))
 
 
 def anchor_basis(anchors: Float64, position: Float64) -> Float64:
     """(n, K) share of each guide in the curve at target ``position`` (n,), linear outside +-TRUSTED_EXTENT."""
     inside = np.clip(position, -TRUSTED_EXTENT, TRUSTED_EXTENT)
     basis = lagrange_basis(anchors, inside)
-    outside = position - inside
-    if outside.any():
-        step = 1e-5
-        slope = (lagrange_basis(anchors, inside + step) - lagrange_basis(anchors, inside - step)) / (2 * step)
-        basis = basis + outside[:, None] * slope
+    outside = np.flatnonzero(position != inside)
+    if len(outside):
+        step, held = 1e-5, inside[outside]
+        slope = (lagrange_basis(anchors, held + step) - lagrange_basis(anchors, held - step)) / (2 * step)
+        basis[outside] += (position[outside] - held)[:, None] * slope
     return basis
 
 

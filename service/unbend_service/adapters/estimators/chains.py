@@ -109,7 +109,7 @@ def _trace(grey: npt.NDArray[np.uint8]) -> _Points | None:
     columns, rows, chain, along = _ordered_pixels(edges)
     if len(columns) == 0:
         return None
-    order = np.lexsort((along, chain))
+    order = np.argsort(chain * len(chain) + along, kind="stable")
     columns, rows, chain = columns[order], rows[order], chain[order]
     x, y, strength = _subpixel(columns, rows, gradient_x, gradient_y, magnitude)
     return _split_at_corners(x, y, strength, chain)
@@ -132,11 +132,13 @@ def _simple_edges(gradient_x: FloatArray, gradient_y: FloatArray, magnitude: Flo
     )
     edges[:BORDER_PX] = edges[-BORDER_PX:] = False
     edges[:, :BORDER_PX] = edges[:, -BORDER_PX:] = False
-    for down, right in ((1, 1), (-1, -1), (1, -1), (-1, 1)):
+    inner, above, below = edges[1:-1, 1:-1], edges[:-2, 1:-1], edges[2:, 1:-1]
+    left, right = edges[1:-1, :-2], edges[1:-1, 2:]
+    for vertical, across in ((below, right), (above, left), (below, left), (above, right)):
         # The corner pixel of an L can go: its two 4-neighbours stay connected diagonally.
-        vertical, horizontal = np.roll(edges, -down, 0), np.roll(edges, -right, 1)
-        opposite_vertical, opposite_horizontal = np.roll(edges, down, 0), np.roll(edges, right, 1)
-        edges = edges & ~(vertical & horizontal & ~opposite_vertical & ~opposite_horizontal)
+        corner = vertical & across
+        corner &= (above ^ below) & (left ^ right)
+        inner ^= inner & corner
     crowd = cv2.boxFilter(edges.astype(np.uint8), cv2.CV_8U, (3, 3), normalize=False)
     return edges & (np.asarray(crowd) <= 3)
 
@@ -147,13 +149,15 @@ def _links(rows: IntArray, columns: IntArray, shape: tuple[int, int]) -> tuple[I
     index_of = np.full(shape[0] * shape[1], -1, np.int64)
     flat = rows * shape[1] + columns
     index_of[flat] = np.arange(count)
-    neighbours = np.full((count, 2), -1, np.int64)
-    degree = np.zeros(count, np.int64)
-    for down, right in _NEIGHBOURS:
-        candidate = index_of[flat + down * shape[1] + right]
-        found = np.flatnonzero((candidate >= 0) & (degree < 2))
-        neighbours[found, degree[found]] = candidate[found]
-        degree[found] += 1
+    candidates = index_of[flat + np.array([[down * shape[1] + right] for down, right in _NEIGHBOURS])]
+    found = candidates >= 0
+    degree = found.sum(0)
+    neighbours = np.empty((count, 2), np.int64)
+    pixel = np.arange(count)
+    for link in (0, 1):
+        nearest = found.argmax(0)
+        neighbours[:, link] = np.where(degree > link, candidates[nearest, pixel], -1)
+        found[nearest, pixel] = False
     return neighbours, degree
 
 
@@ -199,22 +203,19 @@ def _list_ranking(neighbours: IntArray, longest: int) -> tuple[IntArray, IntArra
     following = np.where(has_next, 2 * safe + (1 - back_link), 2 * pixel + link)
     distance = has_next.astype(np.int64)
     for _ in range(int(np.ceil(np.log2(max(longest, 2)))) + 1):
-        distance = distance + distance[following]
-        following = following[following]
+        distance += distance.take(following)
+        following = following.take(following)
     return (following >> 1).reshape(-1, 2), distance.reshape(-1, 2)
 
 
 def _subpixel(
-    columns: IntArray,
-    rows: IntArray,
-    gradient_x: FloatArray,
-    gradient_y: FloatArray,
-    magnitude: FloatArray,
+    columns: IntArray, rows: IntArray, gradient_x: FloatArray, gradient_y: FloatArray, magnitude: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Parabola through the gradient magnitude one pixel to either side, across the edge."""
-    here = magnitude[rows, columns]
-    across_x = gradient_x[rows, columns] / (here + np.float32(1e-6))
-    across_y = gradient_y[rows, columns] / (here + np.float32(1e-6))
+    flat = rows * magnitude.shape[1] + columns
+    here = magnitude.ravel()[flat]
+    across_x = gradient_x.ravel()[flat] / (here + np.float32(1e-6))
+    across_y = gradient_y.ravel()[flat] / (here + np.float32(1e-6))
     x, y = columns.astype(np.float32), rows.astype(np.float32)
     before = _sampled(magnitude, x - across_x, y - across_y)
     after = _sampled(magnitude, x + across_x, y + across_y)

@@ -15,11 +15,25 @@ PIXELS = 128.0
 """Pixels per isotropic unit of a picture whose long side has 256."""
 _LATTICE = 11
 _ROUNDS = 6
+_SETTLED = 1e-10
 _LEAST_SLOPE = 0.15
 _FURTHEST = 4.0
 _RIDGE = 1e-9
 _SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 """Where x^2, xy, x, y^2, y, 1 stand in the outer product of (x, y, 1) with itself."""
+_ONE, _BY_U, _BY_V, _BY_SQUARE = (4 * _SYMMETRIC + i for i in range(4))
+"""Where its products with 1, u, v and u^2 + v^2 stand among the moments of `_homographies`."""
+_NONE = np.zeros((3, 3), np.int64)
+_NORMAL_PLACES = np.block(
+    [
+        [_ONE, _NONE, _BY_U[:, :2]],
+        [_NONE, _ONE, _BY_V[:, :2]],
+        [_BY_U[:2], _BY_V[:2], _BY_SQUARE[:2, :2]],
+    ]
+)
+_NORMAL_SIGNS = np.kron([[1, 0, -1], [0, 1, -1], [-1, -1, 1]], np.ones((3, 3)))[:8, :8]
+_RIGHT_PLACES = np.concatenate([_BY_U[:, 2], _BY_V[:, 2], _BY_SQUARE[:2, 2]])
+_RIGHT_SIGNS = np.array([1.0, 1, 1, 1, 1, 1, -1, -1])
 
 
 class GuidesView:
@@ -42,6 +56,7 @@ class GuidesView:
         if not np.isfinite(self._target).all() or np.abs(self._target).max() > _FURTHEST:
             raise InvalidGuides("The guides put parts of the picture nowhere.")
         self._share = self._shares()
+        self._scale = np.tile(PIXELS * np.sqrt(self._share), 2)
         self._tangents, self._project = self._tangent_plane()
 
     def _shares(self) -> Float64:
@@ -85,23 +100,21 @@ class GuidesView:
             straightened: (..., n, 2) isotropic targets of ``source``.
 
         Returns:
-            (..., n, 2); its mean square over the points is the squared error of the backward map over the frame of
-            the target, source pixels of a 256 picture.
+            (..., 2 n), those to the right first; the sum of its squares over n is the squared error of the backward
+            map over the frame of the target, source pixels of a 256 picture.
         """
         left = self._aligned(straightened)[1] - self._target
-        return np.asarray(left * (PIXELS * np.sqrt(self._share))[:, None])
+        return np.concatenate([left[..., 0], left[..., 1]], axis=-1) * self._scale
 
-    def residual_near(self, straightened: Float64, pose: Float64) -> Float64:
-        """`residual`, ten times faster, where the best homography is nearly ``pose`` (3, 3): right to first order in
-        what is left after it."""
-        x, y = straightened[..., 0], straightened[..., 1]
+    def residual_near(self, x: Float64, y: Float64, pose: Float64) -> Float64:
+        """`residual` of targets with the axes apart, (..., n) each, ten times faster, where the best homography is
+        nearly ``pose`` (3, 3): right to first order in what is left after it."""
         depth = np.maximum(x * pose[2, 0] + y * pose[2, 1] + pose[2, 2], 0.1)
         left_x = (x * pose[0, 0] + y * pose[0, 1] + pose[0, 2]) / depth - self._target[:, 0]
         left_y = (x * pose[1, 0] + y * pose[1, 1] + pose[1, 2]) / depth - self._target[:, 1]
         left = np.concatenate([left_x, left_y], axis=-1)
-        left = left - (left @ self._project.T) @ self._tangents.T
-        left = left.reshape(*left.shape[:-1], 2, len(self.source))
-        return np.asarray(np.moveaxis(left, -2, -1) * (PIXELS * np.sqrt(self._share))[:, None])
+        left -= (left @ self._project.T) @ self._tangents.T
+        return np.asarray(left * self._scale)
 
     def pose(self, straightened: Float64) -> Float64:
         """(3, 3) homography, isotropic, that takes (n, 2) ``straightened`` nearest to the guides' targets."""
@@ -126,16 +139,9 @@ class GuidesView:
 
 def _homographies(moments: Float64) -> Float64:
     """(..., 3, 3) from sums over points: (..., 6, 4) of (x^2, xy, x, y^2, y, 1) against (1, u, v, u^2 + v^2)."""
-    one, by_u, by_v, by_square = np.moveaxis(moments[..., _SYMMETRIC, :], -1, 0)
-    normal = np.zeros((*one.shape[:-2], 8, 8))
-    normal[..., :3, :3] = normal[..., 3:6, 3:6] = one
-    normal[..., :3, 6:] = -by_u[..., :2]
-    normal[..., 3:6, 6:] = -by_v[..., :2]
-    normal[..., 6:, :3] = -by_u[..., :2, :]
-    normal[..., 6:, 3:6] = -by_v[..., :2, :]
-    normal[..., 6:, 6:] = by_square[..., :2, :2]
-    normal += _RIDGE * np.eye(8)
-    right = np.concatenate([by_u[..., 2], by_v[..., 2], -by_square[..., :2, 2]], axis=-1)
+    flat = moments.reshape(*moments.shape[:-2], -1)
+    normal = flat[..., _NORMAL_PLACES] * _NORMAL_SIGNS + _RIDGE * np.eye(8)
+    right = flat[..., _RIGHT_PLACES] * _RIGHT_SIGNS
     solution = np.linalg.solve(normal, right[..., None])[..., 0]
     last = np.ones((*solution.shape[:-1], 1))
     return np.concatenate([solution, last], axis=-1).reshape(*solution.shape[:-1], 3, 3)
@@ -150,14 +156,19 @@ def _position(family: GuideFamily, monomials: Float64, along: Float64, value: Fl
     """(n,) target position of the guide through ``value`` at ``along``, centred, continued straight far outside."""
     inside = np.clip(along, -TRUSTED_EXTENT, TRUSTED_EXTENT)
     heights = np.vander(inside, family.degree + 1, increasing=True) @ family.coefficients.T
-    deviation = (heights - family.anchors) @ monomials
+    deviation = np.ascontiguousarray(((heights - family.anchors) @ monomials).T)
     position = value.copy()
     for _ in range(_ROUNDS):
         held = np.clip(position, -TRUSTED_EXTENT, TRUSTED_EXTENT)
-        offset, slope = np.zeros_like(position), np.zeros_like(position)
-        for power in range(deviation.shape[1] - 1, -1, -1):
-            slope = slope * held + offset
-            offset = offset * held + deviation[:, power]
+        offset, slope = deviation[-1].copy(), np.zeros_like(position)
+        for term in deviation[-2::-1]:
+            slope *= held
+            slope += offset
+            offset *= held
+            offset += term
         error = position + offset + slope * (position - held) - value
-        position = position - np.clip(error / np.maximum(1 + slope, _LEAST_SLOPE), -0.5, 0.5)
+        step = np.clip(error / np.maximum(1 + slope, _LEAST_SLOPE), -0.5, 0.5)
+        position -= step
+        if np.abs(step).max(initial=0) < _SETTLED:
+            break
     return position

@@ -11,6 +11,7 @@ between target (s, t) and source (x, y). Nodes and anchors are symmetric about 0
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -108,17 +109,27 @@ class GuideFrame:
 
     def bend(self, offset: Float64, half_width: float, half_height: float) -> float:
         """Mean displacement, isotropic, of what no infinitesimal homography explains of small value offsets."""
-        points = target_lattice(13, 13).reshape(-1, 2) * (half_width, half_height)
-        x, y = points.T
-        anchors, nodes = self.anchors, self.nodes
-        down = np.einsum("nk,nd,kd->n", lagrange_basis(anchors, y), lagrange_basis(nodes, x), offset[0])
-        right = np.einsum("nk,nd,kd->n", lagrange_basis(anchors, x), lagrange_basis(nodes, y), offset[1])
-        return mean_bend(points, np.stack([right, down], 1))
+        right, down = _displacements(tuple(self.anchors), tuple(self.nodes), half_width, half_height)
+        return mean_bend(np.stack([right @ offset[1].ravel(), down @ offset[0].ravel()]), half_width, half_height)
 
 
-def mean_bend(points: Float64, moved: Float64) -> float:
-    """Mean length of what no infinitesimal homography explains of displacements (n, 2) of points (n, 2)."""
-    x, y = points.T
+def bend_lattice(half_width: float, half_height: float) -> Float64:
+    """(n, 2) isotropic points of the picture over which :func:`mean_bend` is a mean."""
+    return target_lattice(13, 13).reshape(-1, 2) * (half_width, half_height)
+
+
+def mean_bend(moved: Float64, half_width: float, half_height: float) -> float:
+    """Mean length of what no infinitesimal homography explains of displacements (2, n) of `bend_lattice`."""
+    tangents, project = _tangent_plane(half_width, half_height)
+    flat = moved.ravel()
+    return float(np.hypot(*(flat - tangents @ (project @ flat)).reshape(2, -1)).mean())
+
+
+@lru_cache(maxsize=16)  # by the aspect of pictures
+def _tangent_plane(half_width: float, half_height: float) -> tuple[Float64, Float64]:
+    """Displacements (2 n, 8) of `bend_lattice`, x first, by the infinitesimal homographies, and what takes a
+    displacement to its share of each, (8, 2 n)."""
+    x, y = bend_lattice(half_width, half_height).T
     one, zero = np.ones_like(x), np.zeros_like(x)
     tangents = np.concatenate(
         [
@@ -126,9 +137,21 @@ def mean_bend(points: Float64, moved: Float64) -> float:
             np.stack([zero, one, zero, x, zero, y, x * y, y * y], 1),
         ]
     )
-    flat = moved.T.ravel()
-    plane = np.linalg.solve(tangents.T @ tangents + 1e-9 * len(flat) * np.eye(8), tangents.T @ flat)
-    return float(np.hypot(*(flat - tangents @ plane).reshape(2, -1)).mean())
+    normal = tangents.T @ tangents + 1e-9 * len(tangents) * np.eye(8)
+    return tangents, np.linalg.solve(normal, tangents.T)
+
+
+@lru_cache(maxsize=16)
+def _displacements(
+    anchors: tuple[float, ...], nodes: tuple[float, ...], half_width: float, half_height: float
+) -> tuple[Float64, Float64]:
+    """What takes offsets of column values, and of row values, each (K (degree + 1),), to displacements (n,) of
+    `bend_lattice`, to the right and down."""
+    over_anchors, over_nodes = np.array(anchors), np.array(nodes)
+    x, y = bend_lattice(half_width, half_height).T
+    right = lagrange_basis(over_anchors, x)[:, :, None] * lagrange_basis(over_nodes, y)[:, None, :]
+    down = lagrange_basis(over_anchors, y)[:, :, None] * lagrange_basis(over_nodes, x)[:, None, :]
+    return right.reshape(len(x), -1), down.reshape(len(x), -1)
 
 
 def mirrored(values: Float64) -> Float64:

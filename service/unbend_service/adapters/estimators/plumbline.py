@@ -39,6 +39,7 @@ _VALUES = np.polynomial.legendre.legvander(_POSITIONS, _DEGREE)
 """(NODES, degree + 1): Legendre polynomials at the nodes."""
 _ANALYSIS = (_VALUES * _QUADRATURE[:, None] * (2 * np.arange(_DEGREE + 1) + 1) / 2).T
 """(degree + 1, NODES): Legendre coefficients from values at the nodes."""
+_SHAPE_ANALYSIS = np.ascontiguousarray(_ANALYSIS[1:].T)
 _RIDGE = np.array([0.0, 0.0, 0.02, 0.05, 0.1]) + 1e-9
 """Shrinks the higher coefficients of chains with few points, in units of one point's worth of evidence."""
 
@@ -60,6 +61,7 @@ _SHARES = np.array(
     ]
 )
 """(class of length, straight classes then natural classes)."""
+_STRAIGHT_PRECISION = 1 / _STRAIGHT_SPREAD_PX**2
 _WEIGHTS = np.array([0.166, 0.301, 0.435, 0.447, 0.488])
 """By class of length: the share of its log likelihood that a chain may say, as chains are not independent."""
 
@@ -94,11 +96,14 @@ class Plumbline:
 
         They are scaled to the length that the chain has in the picture, so that a map gains nothing by shrinking it.
         """
-        points = straightened.reshape(*straightened.shape[:-2], self.count, NODES, 2)
-        shape = _ANALYSIS[1:] @ points
-        along = shape[..., 0, :]
-        across = shape[..., 1:, 1] * along[..., None, 0] - shape[..., 1:, 0] * along[..., None, 1]
-        squared = np.maximum((along**2).sum(-1), 1e-12)
+        return self.bends_of_axes(straightened[..., 0], straightened[..., 1])
+
+    def bends_of_axes(self, x: Float64, y: Float64) -> Float64:
+        """`bends` with the axes apart, (..., count * NODES) each: two large products for many small ones."""
+        shape = (*x.shape[:-1], self.count, _DEGREE)
+        right, down = ((axis.reshape(-1, NODES) @ _SHAPE_ANALYSIS).reshape(shape) for axis in (x, y))
+        across = down[..., 1:] * right[..., :1] - right[..., 1:] * down[..., :1]
+        squared = np.maximum(right[..., 0] ** 2 + down[..., 0] ** 2, 1e-12)
         return np.asarray(across * (self.length_px / (2 * squared))[..., None])
 
     def log_likelihood(self, bends: Float64) -> Float64:
@@ -109,7 +114,7 @@ class Plumbline:
         """(count, 3) weights, 1/px^2, with which bends (count, 3) enter iteratively reweighted least squares."""
         straight = self._straight(bends)
         share = straight / (1 + straight.sum(-1, keepdims=True))
-        return np.asarray(self._weight[:, None] * (share @ (1 / _STRAIGHT_SPREAD_PX**2)))
+        return np.asarray(self._weight[:, None] * (share @ _STRAIGHT_PRECISION))
 
     def sure(self, bends: Float64) -> tuple[Float64, Float64]:
         """Of bends (count, 3): the weight (count,) of each chain that is straight for sure, 0 for all others, and
@@ -120,13 +125,14 @@ class Plumbline:
         straight = self._straight(bends).sum(-1) > 1
         if straight.sum() < _FEWEST_SURE:
             return np.zeros(self.count), np.ones(3)
-        spread = np.maximum(1.5 * np.median(np.abs(bends[straight]), axis=0), _LEAST_SPREAD_PX)
+        size = np.sort(np.abs(bends[straight]), axis=0)  # np.median takes five times as long for so few
+        middle = (size[(len(size) - 1) // 2] + size[len(size) // 2]) / 2
+        spread = np.maximum(1.5 * middle, _LEAST_SPREAD_PX)
         return self._weight * straight, spread
 
     def _straight(self, bends: Float64) -> Float64:
         """(..., count, class) odds of each straight class against natural curves."""
-        exponent = self._log_odds - 0.5 * bends**2 @ (1 / _STRAIGHT_SPREAD_PX**2).T
-        return np.asarray(np.exp(exponent))
+        return np.asarray(np.exp(self._log_odds - (0.5 * bends * bends) @ _STRAIGHT_PRECISION.T))
 
 
 def _quartics(chains: EdgeChains) -> tuple[Float64, Float64]:

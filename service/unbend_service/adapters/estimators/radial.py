@@ -28,7 +28,13 @@ import numpy.typing as npt
 from unbend_service.adapters.estimators.chains import EdgeChains
 from unbend_service.adapters.estimators.guides_view import PIXELS, GuidesView
 from unbend_service.adapters.estimators.plumbline import Plumbline
-from unbend_service.adapters.estimators.radial_family import IDENTITY, guides_of_lens, is_lens, straighten
+from unbend_service.adapters.estimators.radial_family import (
+    IDENTITY,
+    guides_of_lens,
+    is_lens,
+    straighten,
+    straighten_axes,
+)
 from unbend_service.domain.errors import InvalidGuides
 from unbend_service.domain.guides import Guides
 
@@ -61,6 +67,9 @@ _STEPS = np.array([1e-3, 1e-3, 2e-3, 2e-3])
 _ROUNDS = 9
 _SHARPENING_ROUNDS = 6
 _SETTLED = 1e-2
+_SHARP = 1e-5
+"""Steps get ten times smaller or more from one to the next: what is left after one like this is a ten-thousandth of a
+pixel."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +96,7 @@ class Refinement:
 
 @dataclass(frozen=True)
 class _Hypothesis:
-    """A candidate: its nonlinear displacement (n, 2) px over the lattice, log evidence, and own rms error px."""
+    """A candidate: its nonlinear displacement (2 n,) px over the lattice, log evidence, and own rms error px."""
 
     kind: Kind
     residual: Float64
@@ -122,7 +131,7 @@ def refine(chains: EdgeChains, guides: Guides, guide_error: float | None) -> Ref
     scores = np.array([h.log_evidence for h in hypotheses])
     probability = np.exp(scores - np.logaddexp.reduce(scores))
     best = hypotheses[int(np.argmax(probability))]
-    apart = np.array([((h.residual - best.residual) ** 2).sum(-1).mean() + h.spread**2 for h in hypotheses])
+    apart = np.array([2 * ((h.residual - best.residual) ** 2).mean() + h.spread**2 for h in hypotheses])
     sums: dict[Kind, float] = {"identity": 0.0, "radial": 0.0, "guides": 0.0}
     for hypothesis, share in zip(hypotheses, probability, strict=True):
         sums[hypothesis.kind] += float(share)
@@ -154,7 +163,7 @@ def _unchanged(guides: Guides, error: float, chains: int) -> Refinement:
 
 @dataclass(frozen=True)
 class _State:
-    """A lens and its neighbours: parameters (1 + k, 4), bends (1 + k, chains, 3), residual (1 + k, n, 2)."""
+    """A lens and its neighbours: parameters (1 + k, 4), bends (1 + k, chains, 3), residual (1 + k, 2 n)."""
 
     parameters: Float64
     bends: Float64
@@ -170,7 +179,7 @@ class _Model:
         self._view = view
         self._error = error
         self._count = len(view.source)
-        self._points = np.concatenate([plumbline.nodes, view.source])
+        self._x, self._y = np.ascontiguousarray(np.concatenate([plumbline.nodes, view.source]).T)
         self._pose: Float64 | None = None
 
     def scan(self) -> tuple[Float64, Float64]:
@@ -179,7 +188,7 @@ class _Model:
         lenses = np.zeros((len(_SCAN), 4))
         lenses[:, 0] = _SCAN
         state = self._look(lenses)
-        far = (state.residual**2).sum(-1).mean(-1)
+        far = (state.residual**2).sum(-1) / self._count
         nearest = int(np.clip(np.argmin(far), 1, len(far) - 2))
         before, here, after = far[nearest - 1 : nearest + 2]
         bottom = np.clip(0.5 * (before - after) / max(before - 2 * here + after, 1e-9), -1, 1)
@@ -200,7 +209,7 @@ class _Model:
         bends = self._plumbline.bends(self._view.straighten(self._plumbline.nodes))
         said = float(self._plumbline.log_likelihood(bends))
         freedom = 0.5 * DIMENSIONS * np.log1p((NATURAL_BEND_PX / self._error) ** 2)
-        nothing = np.zeros((self._count, 2))
+        nothing = np.zeros(2 * self._count)
         return _Hypothesis("guides", nothing, float(LOG_PRIOR["guides"] + said - freedom), self._error)
 
     def fit(self, start: Float64, free: npt.NDArray[np.int64]) -> _Hypothesis:
@@ -240,6 +249,8 @@ class _Model:
         begun = state.parameters[0, free]
         for _ in range(_SHARPENING_ROUNDS):
             weight, spread = self._plumbline.sure(state.bends[0])
+            if not weight.any():
+                break
 
             def cost(found: _State, weight: Float64 = weight, spread: Float64 = spread) -> float:
                 away = found.parameters[0, free] - begun
@@ -250,12 +261,15 @@ class _Model:
             pull = ((weight / (1 + square))[:, None] / spread**2).ravel()
             bend = (state.bends[1:] - state.bends[0]).reshape(len(free), -1).T / _STEPS[free]
             slope = bend.T @ (pull * state.bends[0].ravel()) + normal @ (state.parameters[0, free] - begun)
+            step = np.linalg.solve((bend.T * pull) @ bend + normal, slope)
             tried = state.parameters[0].copy()
-            tried[free] -= np.linalg.solve((bend.T * pull) @ bend + normal, slope)
+            tried[free] -= step
             following = self._around(tried, free)
             if cost(following) >= cost(state) or not np.isfinite(following.cost[0]):
                 break
             state = following
+            if np.abs(step).max() < _SHARP:
+                break
         return state
 
     def _around(self, lens: Float64, free: npt.NDArray[np.int64]) -> _State:
@@ -264,18 +278,21 @@ class _Model:
         return self._look(lenses)
 
     def _look(self, lenses: Float64) -> _State:
-        straightened = straighten(lenses, self._points)
-        bends = self._plumbline.bends(straightened[:, : -self._count])
-        seen = straightened[:, -self._count :]
-        residual = self._view.residual(seen) if self._pose is None else self._view.residual_near(seen, self._pose)
-        far = (residual**2).sum(-1).mean(-1)
+        x, y = straighten_axes(lenses, self._x, self._y)
+        bends = self._plumbline.bends_of_axes(x[:, : -self._count], y[:, : -self._count])
+        x, y = x[:, -self._count :], y[:, -self._count :]
+        if self._pose is None:
+            residual = self._view.residual(np.stack([x, y], axis=-1))
+        else:
+            residual = self._view.residual_near(x, y, self._pose)
+        far = (residual * residual).sum(-1) / self._count
         cost = 0.5 * ((lenses / PRIOR_SPREAD) ** 2).sum(-1) - self._plumbline.log_likelihood(bends)
         cost += 0.5 * (NU + DIMENSIONS) * np.log1p(far / (NU * self._error**2))
         return _State(lenses, bends, residual, np.where(is_lens(lenses), cost, np.inf))
 
     def _sensitivity(self, state: _State, free: npt.NDArray[np.int64]) -> Float64:
         """(2 n, k) derivative of the nonlinear displacement, scaled so that its square is a mean over the lattice."""
-        difference = (state.residual[1:] - state.residual[0]).reshape(len(free), -1)
+        difference = state.residual[1:] - state.residual[0]
         return np.asarray((difference / _STEPS[free, None]).T / np.sqrt(self._count))
 
     def _normal(self, state: _State, free: npt.NDArray[np.int64]) -> tuple[Float64, Float64]:
@@ -284,7 +301,7 @@ class _Model:
         weight = self._plumbline.precision(state.bends[0]).ravel()
         bend = (state.bends[1:] - state.bends[0]).reshape(len(free), -1).T / _STEPS[free]
         moved = self._sensitivity(state, free)
-        residual = state.residual[0].ravel() / np.sqrt(self._count)
+        residual = state.residual[0] / np.sqrt(self._count)
         pull = (NU + DIMENSIONS) / (NU * self._error**2 + residual @ residual)
         normal = np.diag(prior) + (bend.T * weight) @ bend + pull * moved.T @ moved
         slope = prior * state.parameters[0, free] + bend.T @ (weight * state.bends[0].ravel())

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from unbend_service.adapters.estimators.isotropic_guides import mean_bend
+from unbend_service.adapters.estimators.isotropic_guides import bend_lattice, mean_bend
 from unbend_service.domain.guides import GuideFamily, Guides, anchor_basis, power_basis
 from unbend_service.domain.homography import apply_homography
 from unbend_service.domain.maps import Float64, target_lattice
@@ -37,11 +37,17 @@ _SQUARES: Float64 = np.linspace(0, _TRUSTED_RADIUS, 24) ** 2
 
 def straighten(parameters: Float64, source: Float64) -> Float64:
     """Source (n, 2) -> target (..., n, 2), isotropic, of each lens in ``parameters`` (..., 4)."""
-    centre = parameters[..., None, 2:]
-    offset = source - centre
-    square = (offset**2).sum(-1)
-    denominator = 1 + square * (parameters[..., :1] + square * parameters[..., 1:2])
-    return np.asarray(centre + offset / np.maximum(denominator, _LEAST_DENOMINATOR)[..., None])
+    return np.stack(straighten_axes(parameters, source[:, 0], source[:, 1]), axis=-1)
+
+
+def straighten_axes(parameters: Float64, x: Float64, y: Float64) -> tuple[Float64, Float64]:
+    """`straighten` with the axes apart, which is twice as fast: (n,) each -> (..., n) each."""
+    first, second, centre_x, centre_y = (parameters[..., i, None] for i in range(4))
+    across, down = x - centre_x, y - centre_y
+    square = across * across + down * down
+    denominator = 1 + square * (first + square * second)
+    np.maximum(denominator, _LEAST_DENOMINATOR, out=denominator)
+    return centre_x + across / denominator, centre_y + down / denominator
 
 
 def is_lens(parameters: Float64) -> npt.NDArray[np.bool_]:
@@ -55,9 +61,8 @@ def is_lens(parameters: Float64) -> npt.NDArray[np.bool_]:
 
 def displacement_of_lens(parameters: Float64, half_width: float, half_height: float) -> float:
     """Mean displacement, isotropic, of what no infinitesimal homography explains of the lens (4,)."""
-    points = target_lattice(13, 13).reshape(-1, 2) * (half_width, half_height)
-    moved = _continued(parameters, points) - points
-    return mean_bend(points, moved)
+    points = bend_lattice(half_width, half_height)
+    return mean_bend((_continued(parameters, points) - points).T, half_width, half_height)
 
 
 def guides_of_lens(parameters: Float64, pose: Float64, half_width: float, half_height: float) -> Guides:
