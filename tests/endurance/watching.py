@@ -27,11 +27,11 @@ class Watched:
         return psutil.Process(self.served.pid)
 
     def workers(self) -> list[psutil.Process]:
-        """Render workers that live."""
+        """Render workers that live and have started; deputies are none."""
         found = []
         for child in self.process.children():
             try:
-                if child.status() != psutil.STATUS_ZOMBIE and any("renderers.worker" in p for p in child.cmdline()):
+                if child.status() != psutil.STATUS_ZOMBIE and child.name().startswith("unbend-render"):
                     found.append(child)
             except psutil.NoSuchProcess:
                 continue

@@ -14,6 +14,7 @@ import pytest
 from tests.adapters.renderers import misbehaving
 from tests.adapters.renderers.conftest import MakePool, slot_descriptors, until, worker_processes
 from tests.fakes import RecordingMeter
+from unbend_service.adapters.renderers import supervision
 from unbend_service.adapters.renderers.cpu import CpuRenderer
 from unbend_service.adapters.renderers.pool import WorkerPool
 from unbend_service.domain.errors import (
@@ -217,14 +218,19 @@ async def test_a_worker_that_hangs_has_a_deputy_by_then(make_pool: MakePool, met
     rendering = asyncio.create_task(pool.render(source, GRID, BLACK))
     await until(lambda: len(worker_processes()) == 2)
     assert pool.state().workers[0].pid == hanging
-    (deputy,) = {process.pid for process in worker_processes()} - {hanging}
+    (deputy,) = (process for process in worker_processes() if process.pid != hanging)
+    await until(lambda: deputy.name() == "unbend-deputy0")
     np.testing.assert_array_equal(await rendering, expected(source))
-    assert pool.state().workers[0].pid == deputy
+    assert pool.state().workers[0].pid == deputy.pid
+    await until(lambda: deputy.name() == "unbend-render0")
     assert meter.restarts == {"hung": 1}
 
 
-async def test_a_deputy_goes_when_the_frame_comes_after_all(make_pool: MakePool, meter: RecordingMeter) -> None:
-    """A frame that takes long costs a process for that time, and no worker."""
+async def test_a_deputy_goes_when_the_frame_comes_after_all(
+    make_pool: MakePool, meter: RecordingMeter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A frame that takes long costs a process for a while, and no worker."""
+    monkeypatch.setattr(supervision, "_DEPUTY_STAYS_S", 0.1)
     pool = await make_pool(hang_s=6.0)
     slow = pool.state().workers[0].pid
     assert slow is not None

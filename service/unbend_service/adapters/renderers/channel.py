@@ -37,6 +37,13 @@ class Begin:
 
 
 @dataclass(frozen=True, slots=True)
+class Rename:
+    """To a worker: how the system's process list shows it from now on."""
+
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
 class MapSlot:
     """To a worker: map this memory; its descriptor comes with the message."""
 
@@ -105,7 +112,7 @@ class Failed:
     error: UnbendError
 
 
-ToWorker = Begin | MapSlot | UnmapSlots | Task
+ToWorker = Begin | Rename | MapSlot | UnmapSlots | Task
 FromWorker = Ready | Done | Failed
 
 

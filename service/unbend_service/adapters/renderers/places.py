@@ -17,7 +17,8 @@ class Place:
         failures: workers in a row that died here before they were of use.
         timer: the limit of what it does now (starting, rendering one frame), or the wait before the next start.
         suspicion: the moment at which a deputy is started.
-        deputy: takes over if the worker is killed; goes if it answers after all.
+        deputy: takes over when the worker is gone.
+        dismissal: the moment at which the deputy goes because it was not needed.
         verdict: why it was killed, if it was.
     """
 
@@ -28,6 +29,7 @@ class Place:
     timer: asyncio.TimerHandle | None = None
     suspicion: asyncio.TimerHandle | None = None
     deputy: WorkerProcess | None = None
+    dismissal: asyncio.TimerHandle | None = None
     verdict: str = ""
 
     def stop_timer(self) -> None:
@@ -35,6 +37,11 @@ class Place:
             if timer is not None:
                 timer.cancel()
         self.timer = self.suspicion = None
+
+    def keep_deputy(self) -> None:
+        if self.dismissal is not None:
+            self.dismissal.cancel()
+            self.dismissal = None
 
     def state(self) -> WorkerState:
         worker = self.worker

@@ -26,6 +26,8 @@ _START_TIMEOUT_S = 60.0
 _SOUND_LIFE_S = 2.0
 #: After this share of what a frame may take a deputy is started: should it hang, nobody waits for the start of another.
 _SUSPECT = 0.25
+#: A deputy that was not needed stays for so long: where one frame is late others will be, and each start costs.
+_DEPUTY_STAYS_S = 30.0
 _FAILURES_TO_GIVE_UP = 3
 _LONGEST_BACKOFF_S = 30.0
 _LAST_WORDS_S = 2.0
@@ -161,7 +163,10 @@ class Supervisor:
     def _launch(self, place: Place) -> None:
         place.timer = None
         place.verdict = ""
+        place.keep_deputy()
         try:
+            if place.deputy is not None:
+                place.deputy.take_over()
             place.worker, place.deputy = place.deputy or self._started(place), None
         except OSError as error:
             self._last_error = f"{type(error).__name__}: {error}"
@@ -174,19 +179,28 @@ class Supervisor:
             self._on_ready(place, place.worker, place.worker.info)
         self._listener.on_change()
 
-    def _started(self, place: Place) -> WorkerProcess:
+    def _started(self, place: Place, *, deputy: bool = False) -> WorkerProcess:
         loop = asyncio.get_running_loop()
-        worker = WorkerProcess(place.index, self._factory, self._options, loop.time())
+        worker = WorkerProcess(place.index, self._factory, self._options, loop.time(), deputy=deputy)
         loop.add_reader(worker.channel.fileno(), self._read, place, worker)
         return worker
 
     def _suspect(self, place: Place) -> None:
+        place.keep_deputy()
         if place.deputy is None:
+            log.info("frame takes long: another worker is started", worker=place.index)
             with suppress(OSError):  # it will be tried again when it is needed
-                place.deputy = self._started(place)
+                place.deputy = self._started(place, deputy=True)
+
+    def _dismiss_later(self, place: Place) -> None:
+        """The deputy was not needed this time."""
+        if place.deputy is not None and place.dismissal is None:
+            loop = asyncio.get_running_loop()
+            place.dismissal = loop.call_later(_DEPUTY_STAYS_S, self._dismiss, place)
 
     def _dismiss(self, place: Place) -> None:
         """The deputy is not needed, or of no use."""
+        place.keep_deputy()
         if place.deputy is not None:
             deputy, place.deputy = place.deputy, None
             deputy.kill()
@@ -221,7 +235,7 @@ class Supervisor:
             else:
                 self._listener.on_answer(worker, message)
                 place.stop_timer()
-                self._dismiss(place)
+                self._dismiss_later(place)
                 if worker.sent:
                     self._watch_frame(place)
         self._listener.on_change()

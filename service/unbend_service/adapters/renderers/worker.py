@@ -25,6 +25,7 @@ from unbend_service.adapters.renderers.channel import (
     MapSlot,
     Place,
     Ready,
+    Rename,
     Task,
     ToWorker,
     UnmapSlots,
@@ -64,6 +65,8 @@ class Worker:
             message, fd = self._next()
             if isinstance(message, MapSlot) and fd is not None:
                 self._slots[message.slot] = Slot(message.slot, fd, message.size_bytes)
+            elif isinstance(message, Rename):
+                _name(message.name)
             elif isinstance(message, UnmapSlots):
                 for number in message.slots:
                     self._slots.pop(number).close()
@@ -128,9 +131,12 @@ def _settle(name: str) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     faulthandler.enable()
-    libc = ctypes.CDLL(None, use_errno=True)
-    libc.prctl(_PR_SET_NAME, name.encode()[:15], 0, 0, 0)
-    libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    _name(name)
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+
+
+def _name(name: str) -> None:
+    ctypes.CDLL(None).prctl(_PR_SET_NAME, name.encode()[:15], 0, 0, 0)
 
 
 def main(arguments: list[str]) -> int:

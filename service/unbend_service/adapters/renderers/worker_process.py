@@ -11,7 +11,17 @@ from contextlib import suppress
 
 import numpy as np
 
-from unbend_service.adapters.renderers.channel import Begin, Channel, FromWorker, MapSlot, Place, Task, UnmapSlots
+from unbend_service.adapters.renderers.channel import (
+    Begin,
+    Channel,
+    FromWorker,
+    MapSlot,
+    Place,
+    Rename,
+    Task,
+    ToWorker,
+    UnmapSlots,
+)
 from unbend_service.adapters.renderers.jobs import Job
 from unbend_service.adapters.renderers.selection import RendererOptions
 from unbend_service.application.ports import RendererInfo
@@ -35,7 +45,9 @@ class WorkerProcess:
         started_s: loop time of its start.
     """
 
-    def __init__(self, index: int, factory: str, options: RendererOptions, started_s: float) -> None:
+    def __init__(
+        self, index: int, factory: str, options: RendererOptions, started_s: float, *, deputy: bool = False
+    ) -> None:
         self.index = index
         self.info: RendererInfo | None = None
         self.refused = False
@@ -62,11 +74,16 @@ class WorkerProcess:
         finally:
             theirs.close()
         with suppress(OSError):  # it is gone already, as the channel will show
-            self.channel.send(Begin(f"unbend-render{index}", factory, options))
+            self.channel.send(Begin(f"unbend-{'deputy' if deputy else 'render'}{index}", factory, options))
 
     @property
     def pid(self) -> int:
         return self._process.pid
+
+    def take_over(self) -> None:
+        """From now on this deputy is the worker of its place."""
+        with suppress(OSError):  # it is gone, as the channel will show
+            self.channel.send(Rename(f"unbend-render{self.index}"))
 
     def begin(self, job: Job) -> None:
         """Tells the worker of a job whose source is in its slot; raises OSError when the worker is gone."""
@@ -115,7 +132,7 @@ class WorkerProcess:
     def receive(self) -> FromWorker:
         """The next message; raises as :meth:`Channel.receive`."""
         message, _ = self.channel.receive()
-        if isinstance(message, Begin | MapSlot | UnmapSlots | Task):
+        if isinstance(message, ToWorker):
             raise EOFError
         return message
 
