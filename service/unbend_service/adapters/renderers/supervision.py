@@ -25,7 +25,7 @@ _START_TIMEOUT_S = 60.0
 #: A worker that lived so long, or was given a frame, was in order: its successor starts at once.
 _SOUND_LIFE_S = 2.0
 #: After this share of what a frame may take a deputy is started: should it hang, nobody waits for the start of another.
-_SUSPECT = 0.25
+_SUSPECT = 0.15
 #: A deputy that was not needed stays for so long: where one frame is late others will be, and each start costs.
 _DEPUTY_STAYS_S = 30.0
 _FAILURES_TO_GIVE_UP = 3
@@ -221,6 +221,7 @@ class Supervisor:
             if worker is place.deputy:
                 if isinstance(message, Ready):
                     worker.info = message.info
+                    log.info("another worker stands by", worker=place.index, pid=worker.pid)
                 else:
                     self._dismiss(place)
                 continue
