@@ -56,7 +56,8 @@ def run(arguments: argparse.Namespace) -> Report:
         tempfile.TemporaryDirectory() as folder,
         served(renderer="cpu", local_socket=f"{folder}/frames.sock") as service,
     ):
-        _shared(report, service, f"{folder}/frames.sock", grid, runs, count)
+        # the memory is made, and met page by page, with each stream: in one of seconds that is spread over its frames
+        _shared(report, service, f"{folder}/frames.sock", grid, runs, 4 * count)
         _raw(report, service, grid, runs, count)
         _jpeg(report, service, grid, runs, count)
         _spent(report, service, f"{folder}/frames.sock", grid, count)
