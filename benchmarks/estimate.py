@@ -5,17 +5,38 @@ from __future__ import annotations
 import argparse
 import asyncio
 import http.client
+import statistics
 import time
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import asdict
+from typing import Any
+from unittest.mock import patch
+
+from onnxruntime import InferenceSession
 
 import unbend
 from benchmarks.material import jpeg, photograph
 from benchmarks.measurement import Report, Timing, by_turns
 from benchmarks.serving import Served, served
+from unbend_service.adapters.codecs.pillow import PillowCodec
+from unbend_service.adapters.cores import usable_cores
+from unbend_service.adapters.estimators import lineset
+from unbend_service.adapters.estimators.catalogue import load_estimator
+from unbend_service.application.estimation import ESTIMATE_LONGEST_PX
 from unbend_service.cli.private import private_service
+from unbend_service.domain.decision import decide
+from unbend_service.domain.records import Correct
 from unbend_service.settings import Settings
 
 BAR_S = 0.040
+#: What the line-set estimator calls, and the part that it belongs to.
+_PARTS = {
+    "fit_long_side": "edge chains",
+    "extract": "edge chains",
+    "describe": "description of the chains",
+    "refine": "radial lenses",
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -52,11 +73,81 @@ def run(arguments: argparse.Namespace) -> Report:
             report.rows.append({"name": "the network's share of gRPC", "share": 1 - 1 / pair.ratio})
             print(f"the network's share: HTTP {share:.0%}, gRPC {1 - 1 / pair.ratio:.0%}", flush=True)
             connection.close()
+            _parts(report, body, runs, settings)
         finally:
             runner.run(context.__aexit__(None, None, None))
     with served() as service:
         _known(report, service, body, runs)
     return report
+
+
+def _parts(report: Report, body: bytes, runs: int, settings: Settings) -> None:
+    """Where the time of one estimate in process goes, if the line-set estimator makes it."""
+    estimator = load_estimator(settings.model, settings.estimator_threads or usable_cores())
+    if not isinstance(estimator, lineset.LinesetEstimator):
+        return
+    codec, spent = PillowCodec(settings), Spent()
+    with ExitStack() as patches:
+        for name, part in _PARTS.items():
+            patches.enter_context(patch.object(lineset, name, spent.timed(part, getattr(lineset, name))))
+        networks = spent.timed("networks", InferenceSession.run)
+        patches.enter_context(patch.object(InferenceSession, "run", networks))
+        for _ in range(runs):
+            grey = spent.timed("luma at half size", codec.decode_grey)(body, ESTIMATE_LONGEST_PX)
+            estimate = spent.timed("the estimator, of which", estimator.estimate)(grey)
+            spent.timed("decision and grid", decide)(
+                estimate.guides,
+                estimate.confidence,
+                estimate.confidence_kind,
+                estimate.model.name,
+                correct=Correct.NONLINEAR,
+                min_confidence=0.0,
+                points=settings.grid_points,
+            )
+            spent.end_turn()
+    whole = (
+        spent.median_s("luma at half size")
+        + spent.median_s("the estimator, of which")
+        + spent.median_s("decision and grid")
+    )
+    inside = [part for part in spent.turns[0] if part in {*_PARTS.values(), "networks"}]
+    for part in ["luma at half size", "the estimator, of which", *inside, "decision and grid"]:
+        share = spent.median_s(part) / whole
+        report.rows.append({"name": f"of an estimate: {part}", "share": share})
+        print(f"of an estimate: {part} {spent.median_s(part) * 1e3:.1f} ms, {share:.0%}", flush=True)
+
+
+class Spent:
+    """Seconds by part, turn by turn.
+
+    Attributes:
+        turns: of each turn that has ended, the seconds of each part.
+    """
+
+    def __init__(self) -> None:
+        self.turns: list[dict[str, float]] = []
+        self._turn: dict[str, float] = {}
+
+    def timed(self, part: str, work: Callable[..., Any]) -> Callable[..., Any]:
+        """``work``, whose time goes to ``part``."""
+
+        def run(*arguments: Any, **options: Any) -> Any:
+            start = time.perf_counter()
+            try:
+                return work(*arguments, **options)
+            finally:
+                self._turn[part] = self._turn.get(part, 0.0) + time.perf_counter() - start
+
+        return run
+
+    def end_turn(self) -> None:
+        """What follows belongs to the next turn."""
+        self.turns.append(self._turn)
+        self._turn = {}
+
+    def median_s(self, part: str) -> float:
+        """Over the turns that have ended."""
+        return statistics.median(turn.get(part, 0.0) for turn in self.turns)
 
 
 def _known(report: Report, service: Served, body: bytes, runs: int) -> None:
