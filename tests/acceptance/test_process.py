@@ -8,6 +8,7 @@ import cv2
 import pytest
 
 from tests.acceptance.conftest import shared_memory_names, start_server, stop_server
+from tests.acceptance.test_endings import eventually
 from tests.acceptance.test_http import facade
 
 
@@ -34,7 +35,7 @@ def test_sigterm_finishes_what_was_accepted_and_leaves_nothing_in_shared_memory(
     assert statuses == [200, 200, 200]
     assert server.process.wait(30) == 0
     stop_server(server)
-    assert shared_memory_names() <= before
+    assert eventually(lambda: shared_memory_names() <= before)
 
 
 @pytest.mark.egl

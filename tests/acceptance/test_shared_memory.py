@@ -15,6 +15,7 @@ import pytest
 
 import unbend
 from tests.acceptance.conftest import Server, shared_memory_names, start_server, stop_server
+from tests.acceptance.test_endings import eventually
 
 WIDTH, HEIGHT = 640, 360
 SHAPE = (HEIGHT * 3 // 2, WIDTH)
@@ -85,6 +86,6 @@ def test_of_a_client_that_is_killed_nothing_is_left(local: tuple[Server, Path]) 
         assert shared_memories(server)
         process.send_signal(signal.SIGKILL)
     until_none(server)
-    assert shared_memory_names() <= before
+    assert eventually(lambda: shared_memory_names() <= before)
     with unbend.Client(server.grpc, shared_memory=path) as client, client.stream(WIDTH, HEIGHT, "i420") as stream:
         assert len(list(stream.correct([np.zeros(SHAPE, np.uint8)] * 10))) == 10
