@@ -30,6 +30,7 @@ class LocalServer(Server):
 
     def stop(self) -> None:
         if not self._stopped:
+            self._thread.run(self._server.stop(0))  # as in the service: memory goes when nobody can ask for it any more
             self._thread.call(self._listener.close)
         super().stop()
 
