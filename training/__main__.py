@@ -93,7 +93,7 @@ def _parser() -> argparse.ArgumentParser:
 
     calibrate = verbs.add_parser("calibrate", help="fit the confidence of a checkpoint on training photographs")
     calibrate.add_argument("--name", default="run-cooled")
-    calibrate.add_argument("--limit", type=int, default=100, help="photographs per family")
+    calibrate.add_argument("--limit", type=int, default=150, help="photographs per family")
     calibrate.set_defaults(verb=_calibrate)
 
     for verb in (export, calibrate):

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -63,6 +65,17 @@ def test_a_mirrored_picture_mirrors_its_samples() -> None:
     one, other = describe(arcs([0.04])).features[0], describe(arcs([0.04]).mirrored()).features[0]
     np.testing.assert_allclose(one[:SAMPLES], -other[:SAMPLES][::-1], atol=1e-5)
     np.testing.assert_allclose(one[SAMPLES : 2 * SAMPLES], other[SAMPLES : 2 * SAMPLES][::-1], atol=1e-5)
+
+
+def test_a_chain_is_described_the_same_in_any_company() -> None:
+    """Longer chains beside it, or other pictures of the batch, take no part in its samples."""
+    long, short = arcs([0.02]), arcs([0.2])
+    short = replace(short, x=short.x / 4, y=short.y + short.x**3)
+    per_point = ("x", "y", "strength", "starts", "picture")
+    joined = {name: np.concatenate([getattr(long, name), getattr(short, name)]) for name in per_point}
+    samples = slice(3 * SAMPLES)
+    together = describe(replace(long, **joined)).features[1]
+    np.testing.assert_allclose(together[samples], describe(short).features[0, samples], atol=1e-4)
 
 
 @given(st.lists(st.floats(-2, 2, width=32), min_size=0, max_size=40), st.integers(1, 20))

@@ -263,7 +263,8 @@ def _resampled(chains: _Segments) -> tuple[FloatArray, FloatArray, BoolArray]:
     reverse = np.where(np.abs(span_x) >= np.abs(span_y), span_x < 0, span_y < 0)
     share = np.where(reverse[:, None], 1 - _PARAMETER, _PARAMETER)
     # One search over all chains: each chain's arc is shifted past the end of the one before it.
-    shift = np.cumsum(chains.length.astype(np.float64) + 1.0)
+    room = chains.length.astype(np.float64) + 1.0
+    shift = np.cumsum(room) - room
     counts = chains.last - chains.first + 1
     global_arc = chains.arc + np.repeat(shift, counts)
     wanted = shift[:, None] + share * chains.length[:, None].astype(np.float64)
