@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import structlog
@@ -9,6 +11,7 @@ from hypothesis import settings
 
 from benchmarks.companions import Companion, redis_server
 from tests.companions import started
+from tests.fakes import RECORD
 
 # The time of an example is no property of the code on a shared machine, and a failure must come back on the next run.
 settings.register_profile("unbend", deadline=None, derandomize=True, max_examples=40)
@@ -32,3 +35,11 @@ def redis(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Companion]:
     running = started(lambda: redis_server(tmp_path_factory.mktemp("redis")))
     yield running
     running.stop()
+
+
+@pytest.fixture
+def record_file(tmp_path: Path) -> Path:
+    """`RECORD` as the file that `unbend grid` reads and writes."""
+    path = tmp_path / "grid.json"
+    path.write_text(json.dumps(RECORD.to_dict()))
+    return path

@@ -25,6 +25,7 @@ from unbend_service.domain.frames import Border, Frame, split_planes
 from unbend_service.domain.grid import Grid
 from unbend_service.domain.guides import GuideFamily, Guides
 from unbend_service.domain.maps import pixel_centres
+from unbend_service.domain.records import GridRecord
 
 FAKE_MODEL = ModelInfo(name="fake", sha256="0" * 64)
 
@@ -36,6 +37,9 @@ def barrel_guides(bend: float = 0.06) -> Guides:
     coefficients[:, 0] = anchors * (1 + bend / 2)
     coefficients[:, 2] = -anchors * bend
     return Guides(GuideFamily(anchors, coefficients), GuideFamily(anchors, coefficients))
+
+
+RECORD = GridRecord(Grid.from_map(barrel_guides(), 33, 33))
 
 
 @dataclass

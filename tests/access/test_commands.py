@@ -2,27 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from tests.access.conftest import Guarded
-from tests.fakes import barrel_guides
+from tests.fakes import RECORD
 from unbend_service.cli import app
 from unbend_service.domain.access import Scope, new_token
-from unbend_service.domain.grid import Grid
-from unbend_service.domain.records import GridRecord
-
-RECORD = GridRecord(Grid.from_map(barrel_guides(), 33, 33))
-
-
-@pytest.fixture
-def grid_file(tmp_path: Path) -> Path:
-    path = tmp_path / "grid.json"
-    path.write_text(json.dumps(RECORD.to_dict()))
-    return path
 
 
 def run(*arguments: object, code: int = 0, env: dict[str, str] | None = None) -> str:
@@ -32,14 +20,14 @@ def run(*arguments: object, code: int = 0, env: dict[str, str] | None = None) ->
 
 
 def test_a_command_shows_the_token_of_a_file_or_of_the_environment(
-    guarded: Guarded, grid_file: Path, tmp_path: Path
+    guarded: Guarded, record_file: Path, tmp_path: Path
 ) -> None:
     """Neither the command line nor what is printed has the token in it."""
     token = guarded.tokens.only[Scope.GRIDS]
     file = tmp_path / "token"
     file.write_text(f"{token}\n")
     reached = ("--server", guarded.server.grpc, "--token-file", file)
-    assert RECORD.id in run("grid", "import", grid_file, *reached)
+    assert RECORD.id in run("grid", "import", record_file, *reached)
     assert RECORD.id in run("grid", "show", RECORD.id, *reached)
     named = {"UNBEND_SERVER_TOKEN_FILE": str(file)}
     assert RECORD.id in run("grid", "show", RECORD.id, "--server", guarded.server.grpc, env=named)
