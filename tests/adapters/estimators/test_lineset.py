@@ -147,3 +147,22 @@ def test_a_card_that_does_not_fit_its_weights_is_refused(parameter: str, value: 
     with pytest.raises(ModelUnavailable) as refusal:
         load_estimator(str(tmp_path / "odd.onnx"), threads=1)
     assert refusal.value.setting == "model"
+
+
+def test_a_picture_has_one_grid_wherever_it_lies_in_memory_and_however_many_threads_look(estimator: Estimator) -> None:
+    """Nodes, cores, load and what else was computed before change no bit of an estimate, and so not the grid's id."""
+    two_threads = load_estimator("lineset", threads=2)
+    picture, _ = bent(192, 144, -0.2)
+    place = np.random.default_rng(4)
+    in_the_way: list[Float64] = []
+    seen = set()
+    for turn in range(12):
+        in_the_way.append(np.zeros(int(place.integers(1, 9000))))
+        memory = np.empty(picture.size + 64, np.uint8)
+        moved = memory[turn : turn + picture.size].reshape(picture.shape)
+        moved[:] = picture
+        estimate = (estimator, two_threads)[turn % 2].estimate(moved)
+        record = decide(estimate.guides, 1.0, "", "", correct=Correct.NONLINEAR, min_confidence=0)
+        assert record.outcome is Outcome.CORRECTED
+        seen.add((record.grid.id, estimate.confidence, estimate.guides.rows.coefficients.tobytes()))
+    assert len(seen) == 1

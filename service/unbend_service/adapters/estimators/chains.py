@@ -104,7 +104,8 @@ def _trace(grey: npt.NDArray[np.uint8]) -> _Points | None:
     smooth = cv2.GaussianBlur(grey, (0, 0), 1.0).astype(np.float32)
     gradient_x = np.asarray(cv2.Scharr(smooth, cv2.CV_32F, 1, 0), np.float32)
     gradient_y = np.asarray(cv2.Scharr(smooth, cv2.CV_32F, 0, 1), np.float32)
-    magnitude = np.asarray(cv2.magnitude(gradient_x, gradient_y), np.float32)
+    # Not cv2.magnitude: its last bits follow the addresses of its arguments, and an estimate has to be repeatable.
+    magnitude = np.sqrt(gradient_x * gradient_x + gradient_y * gradient_y)
     edges = _simple_edges(gradient_x, gradient_y, magnitude)
     columns, rows, chain, along = _ordered_pixels(edges)
     if len(columns) == 0:
