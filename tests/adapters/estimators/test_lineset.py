@@ -2,13 +2,16 @@ from __future__ import annotations
 
 import json
 import shutil
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 import pytest
 
+from unbend_service.adapters.estimators import chains, lineset, picture_branch, views
 from unbend_service.adapters.estimators.cards import shipped_models
 from unbend_service.adapters.estimators.catalogue import load_estimator
 from unbend_service.application.ports import Bytes, Estimator
@@ -166,3 +169,25 @@ def test_a_picture_has_one_grid_wherever_it_lies_in_memory_and_however_many_thre
         assert record.outcome is Outcome.CORRECTED
         seen.add((record.grid.id, estimate.confidence, estimate.guides.rows.coefficients.tobytes()))
     assert len(seen) == 1
+
+
+@pytest.mark.parametrize(("threads", "others"), [(1, 0), (2, 1)])
+def test_a_picture_is_looked_at_while_its_chains_are_traced(
+    threads: int, others: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As long as the setting grants a second thread; where it grants one, no other works."""
+    looked, workers = threading.Event(), set()
+
+    def view_of(grey: Bytes) -> npt.NDArray[np.float32]:
+        workers.add(threading.get_ident())
+        looked.set()
+        return views.view_of(grey)
+
+    def extract(grey: Bytes) -> chains.EdgeChains:
+        assert looked.wait(20 * others) or not others
+        return chains.extract(grey)
+
+    monkeypatch.setattr(picture_branch, "view_of", view_of)
+    monkeypatch.setattr(lineset, "extract", extract)
+    assert load_estimator("lineset", threads).estimate(bent(256, 200, -0.1)[0]).confidence > 0
+    assert len(workers - {threading.get_ident()}) == others

@@ -12,7 +12,7 @@ from unbend_service.adapters.estimators.cards import ModelCard
 from unbend_service.adapters.estimators.chain_features import FEATURES, ChainPoints, describe
 from unbend_service.adapters.estimators.chains import extract, fit_long_side
 from unbend_service.adapters.estimators.isotropic_guides import GuideFrame, mirrored
-from unbend_service.adapters.estimators.picture_branch import ChainsAnswer, PictureBranch
+from unbend_service.adapters.estimators.picture_branch import ChainsAnswer, Fused, PictureBranch
 from unbend_service.adapters.estimators.radial import refine
 from unbend_service.adapters.estimators.radial_family import displacement_of_lens
 from unbend_service.adapters.estimators.sessions import open_session
@@ -156,10 +156,11 @@ class LinesetEstimator:
         """The guides of a (height, width) uint8 picture and what speaks for them; straight guides and None where
         there are too few edges to say anything."""
         picture = fit_long_side(grey, self._long_side_px)
+        fused = None if self._branch is None else self._branch.look(picture)
         chains = extract(picture)
         points = ChainPoints.of(chains)
         extent = (chains.half_width, chains.half_height)
-        seen = self._look(points, picture)
+        seen = self._look(points, fused)
         if seen is None:
             return Guides.straight(), None
         values = seen.values
@@ -189,23 +190,22 @@ class LinesetEstimator:
     def _displacement(self, values: Float64, extent: tuple[float, float]) -> float:
         return self._frame.bend(values - self._frame.straight, *extent) * _PIXELS
 
-    def _look(self, points: ChainPoints, picture: Bytes | None = None) -> _Look | None:
-        """What the networks say of chains, and of the picture if it is to be looked at, and of their mirror images;
-        None if there is too little to say anything."""
+    def _look(self, points: ChainPoints, fused: Fused | None = None) -> _Look | None:
+        """What the network says of chains, ``fused`` with what the picture shows, and of their mirror images; None if
+        there is too little to say anything."""
         direct, reflected = describe(points), describe(points.mirrored())
         slots = max(len(direct.features), len(reflected.features))
-        branch = None if picture is None else self._branch
         if slots < FEWEST_CHAINS:
             return None
         pairs = [described.padded(slots) for described in (direct, reflected)]
         told = {"features": np.concatenate([p[0] for p in pairs]), "mask": np.concatenate([p[1] for p in pairs])}
         shape = (2, *self._frame.straight.shape)
-        if branch is None or picture is None:
+        if fused is None:
             nodes, spreads = (np.asarray(output) for output in self._session.run(["nodes", "spreads"], told))
             log_errors, departure = spreads[:, -2:], np.zeros(shape[1:])
         else:
             answer = ChainsAnswer(*map(np.asarray, self._session.run(["nodes", "spreads", "state"], told)))
-            nodes, log_errors = branch.fused(picture, answer)
+            nodes, log_errors = fused(answer)
             departure = (nodes - answer.nodes)[0].reshape(shape[1:]).astype(np.float64)
         one, other = nodes.astype(np.float64).reshape(shape)
         other = mirrored(other)

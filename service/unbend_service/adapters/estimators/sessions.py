@@ -10,13 +10,14 @@ from unbend_service.adapters.cores import usable_cores
 from unbend_service.domain.errors import ModelUnavailable
 
 
-def open_session(weights: Path, threads: int) -> ort.InferenceSession:
+def open_session(weights: Path, threads: int, part: bytes | None = None) -> ort.InferenceSession:
     """A session whose ``run`` may be called from several threads at once.
 
     Left to itself ONNX Runtime takes every core of the host and spins between calls, at the cost of the renderers.
 
     Args:
         weights: the ``.onnx`` file.
+        part: of the network in that file, serialised, which is opened instead of the whole.
         threads: that one call uses, the caller's own among them; 0: as many as usable cores.
 
     Raises:
@@ -30,6 +31,6 @@ def open_session(weights: Path, threads: int) -> ort.InferenceSession:
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
     options.log_severity_level = 3  # its warnings concern the exporter, and would bypass the log
     try:
-        return ort.InferenceSession(str(weights), options, providers=["CPUExecutionProvider"])
+        return ort.InferenceSession(part or str(weights), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # the runtime's errors share no base class but Exception
         raise ModelUnavailable(f"The weights {weights.name!r} cannot be loaded: {error}.", setting="model") from error
