@@ -142,15 +142,24 @@ class Grid:
 
 def cell_orientations(source: npt.NDArray[Any]) -> Float64:
     """(rows - 1, columns - 1, 4) signed areas of the corner triangles of each cell, of a (rows, columns, 2) lattice."""
-    lattice = np.asarray(source, dtype=np.float64)
-    a, b, c, d = lattice[:-1, :-1], lattice[:-1, 1:], lattice[1:, 1:], lattice[1:, :-1]
+    return np.stack(_orientations(source), axis=-1)
 
-    def cross(p: Float64, q: Float64, r: Float64) -> Float64:
-        return np.asarray(
-            (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (r[..., 0] - p[..., 0])
+
+def _orientations(source: npt.NDArray[Any]) -> list[Float64]:
+    """What `cell_orientations` stacks: at each corner, the cross product of the sides that meet there."""
+    x, y = (np.asarray(source[..., axis], dtype=np.float64) for axis in (0, 1))
+    (right_x, down_x), (right_y, down_y) = ((np.diff(axis, axis=1), np.diff(axis, axis=0)) for axis in (x, y))
+    above_x, below_x, above_y, below_y = right_x[:-1], right_x[1:], right_y[:-1], right_y[1:]
+    left_x, beside_x, left_y, beside_y = down_x[:, :-1], down_x[:, 1:], down_y[:, :-1], down_y[:, 1:]
+    return [
+        np.asarray(across_x * along_y - across_y * along_x)
+        for across_x, across_y, along_x, along_y in (
+            (above_x, above_y, left_x, left_y),
+            (above_x, above_y, beside_x, beside_y),
+            (below_x, below_y, beside_x, beside_y),
+            (below_x, below_y, left_x, left_y),
         )
-
-    return np.stack([cross(a, b, d), cross(b, c, a), cross(c, d, b), cross(d, a, c)], axis=-1)
+    ]
 
 
 def folded_share(source: npt.NDArray[Any]) -> float:
@@ -158,12 +167,17 @@ def folded_share(source: npt.NDArray[Any]) -> float:
 
     A lattice that shows nothing of the source counts as folded everywhere.
     """
-    lattice = np.asarray(source, dtype=np.float64)
-    low = np.minimum.reduce([lattice[:-1, :-1], lattice[:-1, 1:], lattice[1:, 1:], lattice[1:, :-1]])
-    high = np.maximum.reduce([lattice[:-1, :-1], lattice[:-1, 1:], lattice[1:, 1:], lattice[1:, :-1]])
-    visible = ((low <= 1) & (high >= -1)).all(axis=-1)
+    visible = _visible(source[..., 0]) & _visible(source[..., 1])
     if not visible.any():
         return 1.0
-    orientation = cell_orientations(lattice)[visible]
+    orientation = np.stack([corner[visible] for corner in _orientations(source)])
+    if orientation.min() > 0 or orientation.max() < 0:
+        return 0.0
     sign = 1.0 if np.median(orientation) > 0 else -1.0
-    return float((orientation * sign <= 0).any(axis=-1).mean())
+    return float((orientation * sign <= 0).any(axis=0).mean())
+
+
+def _visible(axis: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
+    """(rows - 1, columns - 1) whether some of [-1, 1] lies between the corners of a cell."""
+    low, high = np.minimum(axis[:-1], axis[1:]), np.maximum(axis[:-1], axis[1:])
+    return np.asarray((np.minimum(low[:, :-1], low[:, 1:]) <= 1) & (np.maximum(high[:, :-1], high[:, 1:]) >= -1))

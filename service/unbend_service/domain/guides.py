@@ -85,10 +85,14 @@ class GuideFamily:
         Lagrange interpolation over the anchors, continued linearly outside +-TRUSTED_EXTENT. What is interpolated is
         the deviation from straight guides, so that straight ones stay straight to the last bit.
         """
+        return np.ascontiguousarray(self.curves(position).T)
+
+    def curves(self, position: Float64) -> Float64:
+        """:meth:`at` the other way round, (degree + 1, n): a coefficient of all curves lies together."""
         deviation = self.coefficients.copy()
         deviation[:, 0] -= self.anchors
-        curves = anchor_basis(self.anchors, position) @ deviation
-        curves[:, 0] += position
+        curves = deviation.T @ _anchor_shares(self.anchors, position)
+        curves[0] += position
         return np.asarray(curves)
 
 
@@ -134,9 +138,8 @@ class Guides:
 
         Where they touch instead of crossing the map folds; what Newton finds behind that is another branch.
         """
-        row = np.ascontiguousarray(self.rows.at(points[:, 1]).T)
-        column = np.ascontiguousarray(self.columns.at(points[:, 0]).T)
         x, y = points[:, 0].copy(), points[:, 1].copy()
+        row, column = self.rows.curves(y), self.columns.curves(x)
         for _ in range(steps):
             row_y, row_slope = _polynomial(row, x)
             column_x, column_slope = _polynomial(column, y)
@@ -198,25 +201,39 @@ class Guides:
 
 def lagrange_basis(nodes: Float64, position: Float64) -> Float64:
     """(n, K) Lagrange basis polynomials over ``nodes`` (K,) at ``position`` (n,)."""
-    apart = position[:, None] - nodes
-    below, above = np.ones_like(apart), np.ones_like(apart)
-    np.cumprod(apart[:, :-1], axis=1, out=below[:, 1:])
-    np.cumprod(apart[:, :0:-1], axis=1, out=above[:, -2::-1])
+    return np.ascontiguousarray(_lagrange_shares(nodes, position).T)
+
+
+def _lagrange_shares(nodes: Float64, position: Float64) -> Float64:
+    """`lagrange_basis` the other way round, (K, n): a third of the time, as numpy runs along n."""
+    apart = position - nodes[:, None]
+    shares, above = np.ones_like(apart), np.ones_like(position)
+    for k in range(1, len(nodes)):
+        np.multiply(shares[k - 1], apart[k - 1], out=shares[k])
+    for k in range(len(nodes) - 2, -1, -1):
+        above *= apart[k + 1]
+        shares[k] *= above
     between = nodes[:, None] - nodes
     np.fill_diagonal(between, 1.0)
-    return np.asarray(below * above / between.prod(axis=1))
+    shares /= between.prod(axis=1)[:, None]
+    return shares
 
 
 def anchor_basis(anchors: Float64, position: Float64) -> Float64:
     """(n, K) share of each guide in the curve at target ``position`` (n,), linear outside +-TRUSTED_EXTENT."""
+    return np.ascontiguousarray(_anchor_shares(anchors, position).T)
+
+
+def _anchor_shares(anchors: Float64, position: Float64) -> Float64:
+    """`anchor_basis` the other way round, (K, n)."""
     inside = np.clip(position, -TRUSTED_EXTENT, TRUSTED_EXTENT)
-    basis = lagrange_basis(anchors, inside)
+    shares = _lagrange_shares(anchors, inside)
     outside = np.flatnonzero(position != inside)
     if len(outside):
         step, held = 1e-5, inside[outside]
-        slope = (lagrange_basis(anchors, held + step) - lagrange_basis(anchors, held - step)) / (2 * step)
-        basis[outside] += (position[outside] - held)[:, None] * slope
-    return basis
+        slope = (_lagrange_shares(anchors, held + step) - _lagrange_shares(anchors, held - step)) / (2 * step)
+        shares[:, outside] += (position[outside] - held) * slope
+    return shares
 
 
 def power_basis(argument: Float64, degree: int) -> Float64:

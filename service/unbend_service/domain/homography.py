@@ -12,6 +12,20 @@ _LATTICE_POINTS = 33
 _HORIZON = 1e-3
 #: Least eigenvalue of the normal equations, as a share of the greatest, with which they have one solution.
 _LEAST_RANK = 1e-12
+_SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+"""Where x^2, xy, x, y^2, y, 1 stand in the outer product of (x, y, 1) with itself."""
+_ONE, _BY_U, _BY_V, _BY_SQUARE = (_SYMMETRIC + 6 * i for i in range(4))
+"""Where its products with 1, u, v and u^2 + v^2 stand among `_products`."""
+_NORMAL_PLACES = np.block(
+    [
+        [_ONE, _ONE, _BY_U[:, :2]],
+        [_ONE, _ONE, _BY_V[:, :2]],
+        [_BY_U[:2], _BY_V[:2], _BY_SQUARE[:2, :2]],
+    ]
+)
+_NORMAL_SIGNS = np.kron([[1.0, 0, -1], [0, 1, -1], [-1, -1, 1]], np.ones((3, 3)))[:8, :8]
+_RIGHT_PLACES = np.concatenate([_BY_U[:, 2], _BY_V[:, 2], _BY_SQUARE[:2, 2]])
+_RIGHT_SIGNS = np.array([1.0, 1, 1, 1, 1, 1, -1, -1])
 
 
 def apply_homography(matrix: Float64, points: Float64) -> Float64:
@@ -20,9 +34,10 @@ def apply_homography(matrix: Float64, points: Float64) -> Float64:
     Points on the horizon of the middle or behind it have no image; they are put far out instead of coming back from
     the other side.
     """
-    projected = points @ matrix[:, :2].T + matrix[:, 2]
+    x, y = points[..., 0], points[..., 1]
     side = -1.0 if matrix[2, 2] < 0 else 1.0
-    return np.asarray(projected[..., :2] / (np.maximum(projected[..., 2:] * side, _HORIZON) * side))
+    across, down, depth = (row[0] * x + row[1] * y + row[2] for row in matrix * side)
+    return np.asarray(np.stack([across, down], axis=-1) / np.maximum(depth, _HORIZON)[..., None])
 
 
 def fit_homography(target: Float64, source: Float64, weights: Float64 | None = None) -> Float64:
@@ -48,7 +63,7 @@ def fit_homography(target: Float64, source: Float64, weights: Float64 | None = N
     weight = base
     matrix = np.eye(3)
     for _ in range(12):
-        previous, matrix = matrix, _solution(weight @ products)
+        previous, matrix = matrix, _solution(products @ weight)
         if np.abs(matrix - previous).max() < 1e-10:
             break
         across, down, depth = matrix @ homogeneous
@@ -61,25 +76,20 @@ def fit_homography(target: Float64, source: Float64, weights: Float64 | None = N
 
 
 def _products(target: Float64, source: Float64) -> Float64:
-    """(n, 36) float64: what each correspondence adds to the normal equations at weight 1.
+    """(24, n) float64: what each correspondence adds to the normal equations at weight 1.
 
-    With p = (x, y, 1) these are the 3 x 3 products p p^T times 1, u, v and u^2 + v^2. All numbers of the equations are
-    among them, so a round of reweighting is one product of a vector and a matrix, not a decomposition of 2n equations.
+    With p = (x, y, 1) these are the six products of p p^T times 1, u, v and u^2 + v^2. All numbers of the equations are
+    among them, so a round of reweighting is one product of a matrix and a vector, not a decomposition of 2n equations.
     """
-    p = np.concatenate([target, np.ones((len(target), 1))], axis=1)
-    factors = np.concatenate([np.ones((len(target), 1)), source, (source**2).sum(axis=1, keepdims=True)], axis=1)
-    return np.asarray((factors[:, :, None, None] * (p[:, :, None] * p[:, None, :])[:, None]).reshape(-1, 36))
+    x, y = target.T
+    u, v = source.T
+    pairs = np.stack([x * x, x * y, x, y * y, y, np.ones_like(x)])
+    return np.asarray((np.stack([np.ones_like(u), u, v, u * u + v * v])[:, None] * pairs).reshape(24, -1))
 
 
 def _solution(sums: Float64) -> Float64:
     """The homography of the weighted sums of :func:`_products`; raises InvalidGrid."""
-    plain, by_u, by_v, by_square = sums.reshape(4, 3, 3)
-    normal, right = np.zeros((8, 8)), np.empty(8)
-    normal[:3, :3] = normal[3:6, 3:6] = plain
-    normal[:3, 6:], normal[3:6, 6:] = -by_u[:, :2], -by_v[:, :2]
-    normal[6:, :6] = normal[:6, 6:].T
-    normal[6:, 6:] = by_square[:2, :2]
-    right[:3], right[3:6], right[6:] = by_u[:, 2], by_v[:, 2], -by_square[:2, 2]
+    normal, right = sums[_NORMAL_PLACES] * _NORMAL_SIGNS, sums[_RIGHT_PLACES] * _RIGHT_SIGNS
     sizes = np.linalg.eigvalsh(normal) if np.isfinite(normal).all() else np.zeros(8)
     if not sizes[0] > _LEAST_RANK * sizes[-1]:
         raise InvalidGrid("The map has no plane part: its points lie on a line.")
