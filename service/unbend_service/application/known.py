@@ -18,10 +18,10 @@ HASHED_AT_ONCE_BYTES = 512 << 10
 
 def digest(*parts: bytes | Bytes) -> bytes:
     """16 bytes that stand for the content of ``parts``; as good as never the same for two contents."""
-    content = hashlib.blake2b(digest_size=16)
+    content = hashlib.sha256()  # processors have instructions for it: half the time of BLAKE2
     for part in parts:
         content.update(part if isinstance(part, bytes) else part.data)
-    return content.digest()
+    return content.digest()[:16]
 
 
 class Known(Generic[V]):
