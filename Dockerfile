@@ -35,9 +35,10 @@ RUN PYTHONPATH=/opt/build PIP_REQUIRE_HASHES=0 /opt/unbend/bin/pip install --no-
  && find /opt/unbend -type d -name tests -prune -exec rm -rf {} +
 
 FROM ${BASE}
+# libturbojpeg0 keeps JPEGs in planes.
 # libgl1 and libegl1 are glvnd's switchboards; libgl1-mesa-dri holds llvmpipe; NVIDIA's libraries come from the host.
 RUN apt-get update \
- && apt-get install -y --no-install-recommends python3 libegl1 libgl1 libgl1-mesa-dri \
+ && apt-get install -y --no-install-recommends python3 libegl1 libgl1 libgl1-mesa-dri libturbojpeg0 \
  && rm -rf /var/lib/apt/lists/* /var/cache/apt /var/log/apt /var/log/dpkg.log
 COPY deploy/image/10_nvidia.json /usr/share/glvnd/egl_vendor.d/10_nvidia.json
 COPY --from=build /opt/unbend /opt/unbend

@@ -76,6 +76,14 @@ def test_a_redis_that_answers_is_green_and_one_that_does_not_is_red(redis: Compa
     assert "UNBEND_REDIS_URL" in away.remedy
 
 
+def test_without_turbojpeg_it_says_what_is_lost_and_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is a note: everything works without."""
+    monkeypatch.setattr("unbend_service.adapters.codecs.planar_jpegs.LIBRARY", "libno-such-library.so.0")
+    finding = packages.examine_turbojpeg()
+    assert finding.status == "note"
+    assert "libturbojpeg0" in finding.remedy
+
+
 @pytest.fixture
 def copied_model(tmp_path: Path) -> Path:
     name, source = next(iter(shipped_models().items()))

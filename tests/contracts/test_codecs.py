@@ -105,7 +105,7 @@ def outcome(codec: PillowCodec | IsolatedCodec, call: str, body: bytes) -> objec
             return codec.decode_grey(body, 128).tobytes()
         if call == "probe":
             return codec.probe(body), codec.origin(body)
-        image = codec.decode(body)
+        image = codec.decode(body, planes=call == "planes")
     except UnbendError as error:
         return type(error), error.allowed, error.setting
     frame = image.frame
@@ -119,7 +119,7 @@ def outcome(codec: PillowCodec | IsolatedCodec, call: str, body: bytes) -> objec
 def test_both_codecs_see_the_same(isolated: IsolatedCodec, name: str) -> None:
     """Pixels, metadata and refusals."""
     local = PillowCodec(SETTINGS)
-    for call in ("probe", "decode", "grey"):
+    for call in ("probe", "decode", "planes", "grey"):
         assert outcome(isolated, call, BODIES[name]) == outcome(local, call, BODIES[name]), call
 
 

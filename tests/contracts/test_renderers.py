@@ -86,10 +86,10 @@ def photograph(pixel_format: PixelFormat) -> Frame:
     height, width = rgb.shape[:2]
     if pixel_format is PixelFormat.GRAY8:
         data = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    elif pixel_format in (PixelFormat.I420, PixelFormat.NV12):
+    elif pixel_format in (PixelFormat.I420, PixelFormat.NV12, PixelFormat.YUVJ420P):
         y, v, u = cv2.split(cv2.cvtColor(rgb, cv2.COLOR_RGB2YCrCb))
         u, v = (cv2.resize(c, ((width + 1) // 2, (height + 1) // 2), interpolation=cv2.INTER_AREA) for c in (u, v))
-        chroma = [u.ravel(), v.ravel()] if pixel_format is PixelFormat.I420 else [np.stack([u, v], -1).ravel()]
+        chroma = [np.stack([u, v], -1).ravel()] if pixel_format is PixelFormat.NV12 else [u.ravel(), v.ravel()]
         data = np.concatenate([y.ravel(), *chroma])
     else:
         order = {"rgb24": "RGB", "bgr24": "BGR", "rgba": "RGBA", "bgra": "BGRA"}[pixel_format]

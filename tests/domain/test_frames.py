@@ -104,6 +104,14 @@ def test_neutral_borders_have_neutral_chroma() -> None:
         assert Border(level, level, level).samples(PixelFormat.I420) == ((luma,), (128,), (128,))
 
 
+@given(COLOURS)
+def test_border_colours_survive_the_planes_of_a_jpeg(colour: tuple[int, int, int]) -> None:
+    """Read by OpenCV as full range BT.601, the border has the colour that was asked for, within rounding."""
+    (luma,), (blue,), (red,) = Border(*colour).samples(PixelFormat.YUVJ420P)
+    seen = cv2.cvtColor(np.array([[[luma, red, blue]]], np.uint8), cv2.COLOR_YCrCb2RGB)[0, 0]
+    assert np.abs(seen.astype(int) - colour).max() <= 2
+
+
 def test_packed_borders_follow_their_channel_order() -> None:
     """Red first or blue first, alpha last, grey as perceived."""
     border = Border(10, 20, 30, 40)

@@ -112,7 +112,8 @@ class Correction:
         self.check_offered()
         if options.image_format not in (None, *WRITTEN_FORMATS):
             raise InvalidOption(f"format={options.image_format!r} is not written.", allowed=", ".join(WRITTEN_FORMATS))
-        image = await self._blocking.run("decode", self._codec.decode, body)
+        planes = options.image_format in (None, "jpeg")
+        image = await self._blocking.run("decode", self._codec.decode, body, planes=planes)
         source_format = image.image_format
         image_format = options.image_format or (source_format if source_format in WRITTEN_FORMATS else "png")
         if options.border.alpha < 255 and options.fit != CROP:

@@ -308,7 +308,7 @@ class DecodedImage:
     """A decoded picture, upright (EXIF orientation applied).
 
     Attributes:
-        frame: rgb24, rgba or gray8.
+        frame: rgb24, rgba or gray8; yuvj420p where planes were asked for.
         image_format: of the file it came from.
         exif: EXIF block without its orientation, to be written back; None if there was none.
         icc_profile: bytes to be written back; None if there was none or it no longer applies.
@@ -347,8 +347,13 @@ class ImageCodec(Protocol):
         """Reads the header only; raises as :meth:`probe`."""
         ...
 
-    def decode(self, body: bytes) -> DecodedImage:
-        """Raises as :meth:`probe`, and InvalidImage for a broken body."""
+    def decode(self, body: bytes, planes: bool = False) -> DecodedImage:
+        """Raises as :meth:`probe`, and InvalidImage for a broken body.
+
+        Args:
+            planes: whether a jpeg may be left as planes, because it is to be encoded as a jpeg again; where the codec
+                cannot, it comes packed all the same.
+        """
         ...
 
     def decode_grey(self, body: bytes, longest_px: int) -> Bytes:

@@ -126,7 +126,9 @@ class FrameAnswers:
         bound = self.settings.body_bytes
         if len(body) > bound:
             raise BodyTooLarge(f"A frame of {len(body)} bytes.", allowed=f"{bound} bytes", setting="body_bytes")
-        image = await self.turns.run(self.stream_id, lambda: self.blocking.run("decode", self.codec.decode, body))
+        image = await self.turns.run(
+            self.stream_id, lambda: self.blocking.run("decode", self.codec.decode, body, planes=True)
+        )
         if image.image_format != image_format:
             raise InvalidFrame(f"A {image.image_format} file in a stream of {image_format} files.")
         return image

@@ -19,7 +19,7 @@ from unbend_service.cli.diagnosis.machine import (
     examine_http_port,
     examine_memory,
 )
-from unbend_service.cli.diagnosis.packages import examine_extras, examine_versions
+from unbend_service.cli.diagnosis.packages import examine_extras, examine_turbojpeg, examine_versions
 from unbend_service.cli.diagnosis.weights import examine_model
 from unbend_service.cli.reporting import EXIT_FAILED, console, print_json
 from unbend_service.cli.serve import read_settings
@@ -43,6 +43,7 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print the findi
 def examine(settings: Settings) -> Iterator[Finding]:
     """Everything that decides whether, and how well, the service works with these settings on this machine."""
     yield from examine_versions()
+    yield examine_turbojpeg()
     yield examine_cores()
     yield examine_memory(settings)
     yield from examine_graphics(settings)

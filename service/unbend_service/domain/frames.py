@@ -18,7 +18,10 @@ Bytes = npt.NDArray[np.uint8]
 
 
 class PixelFormat(StrEnum):
-    """Raw pixel formats, named as FFmpeg names them where both have them."""
+    """Raw pixel formats, named as FFmpeg names them where both have them.
+
+    ``yuvj420p`` never comes over the wire: it is what a 4:2:0 JPEG holds, i420 in full range.
+    """
 
     GRAY8 = "gray8"
     RGB24 = "rgb24"
@@ -27,6 +30,7 @@ class PixelFormat(StrEnum):
     BGRA = "bgra"
     I420 = "i420"
     NV12 = "nv12"
+    YUVJ420P = "yuvj420p"
 
     @classmethod
     def parse(cls, name: str) -> PixelFormat:
@@ -186,7 +190,8 @@ class Border:
     def samples(self, pixel_format: PixelFormat) -> tuple[tuple[int, ...], ...]:
         """Sample values, one tuple per plane, one number per channel.
 
-        YUV is BT.601 in video range (ITU-R BT.601-7, section 2.5), the convention of 8-bit i420 and nv12.
+        YUV is BT.601 in video range (ITU-R BT.601-7, section 2.5), the convention of 8-bit i420 and nv12; that of
+        ``yuvj420p`` is JFIF's (ITU-T T.871, section 7), in full range.
         """
         r, g, b = self.red, self.green, self.blue
         if pixel_format is PixelFormat.GRAY8:
@@ -199,6 +204,11 @@ class Border:
             return ((r, g, b, self.alpha),)
         if pixel_format is PixelFormat.BGRA:
             return ((b, g, r, self.alpha),)
+        if pixel_format is PixelFormat.YUVJ420P:
+            full = round(0.299 * r + 0.587 * g + 0.114 * b)
+            blue = round(128 - 0.168736 * r - 0.331264 * g + 0.5 * b)
+            red = round(128 + 0.5 * r - 0.418688 * g - 0.081312 * b)
+            return (full,), (min(blue, 255),), (min(red, 255),)
         luma = round(16 + (65.481 * r + 128.553 * g + 24.966 * b) / 255)
         u = round(128 + (-37.797 * r - 74.203 * g + 112.0 * b) / 255)
         v = round(128 + (112.0 * r - 93.786 * g - 18.214 * b) / 255)

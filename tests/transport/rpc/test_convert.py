@@ -31,7 +31,7 @@ def test_every_number_of_the_wire_has_a_meaning(table: dict[int, object], number
 @pytest.mark.parametrize(
     ("values", "meant"),
     [
-        (convert.RAW_FORMATS.values(), PixelFormat),
+        (convert.RAW_FORMATS.values(), set(PixelFormat) - {PixelFormat.YUVJ420P}),
         (convert.CORRECTS.values(), Correct),
         (convert.WHILE_ESTIMATING.values(), WhileEstimating),
         (convert.DELIVERIES.values(), Delivery),
@@ -39,7 +39,7 @@ def test_every_number_of_the_wire_has_a_meaning(table: dict[int, object], number
         (convert.FRAME_STATUSES, FrameStatus),
     ],
 )
-def test_everything_that_can_be_meant_can_be_said(values: object, meant: type) -> None:
+def test_everything_that_can_be_meant_can_be_said(values: object, meant: object) -> None:
     assert set(values) == set(meant)
 
 

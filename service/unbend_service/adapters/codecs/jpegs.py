@@ -6,7 +6,7 @@ better what is wrong.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import simplejpeg
@@ -64,7 +64,17 @@ def encode_packed(
         exif: block to keep, with its ``Exif`` mark, at most 65,533 bytes.
         icc_profile: to keep.
     """
-    body: bytes = simplejpeg.encode_jpeg(pixels, quality, order, _SUBSAMPLINGS[subsampling], fastdct=False)
+    body = simplejpeg.encode_jpeg(pixels, quality, order, _SUBSAMPLINGS[subsampling], fastdct=False)
+    return _with_segments(body, exif, icc_profile)
+
+
+def encode_planes(planes: Sequence[Bytes], quality: int, exif: bytes | None, icc_profile: bytes | None) -> bytes:
+    """A JFIF file of luma (h, w) and two chroma planes of half its size, each uint8, full range; even sizes."""
+    luma, blue, red = (np.ascontiguousarray(plane) for plane in planes)
+    return _with_segments(simplejpeg.encode_jpeg_yuv_planes(luma, blue, red, quality, fastdct=False), exif, icc_profile)
+
+
+def _with_segments(body: bytes, exif: bytes | None, icc_profile: bytes | None) -> bytes:
     segments = b"" if exif is None else _segment(0xE1, exif)
     if icc_profile is not None:
         parts = range(0, len(icc_profile), _ICC_PART_BYTES)

@@ -26,7 +26,8 @@ from PIL.WebPImagePlugin import WebPImageFile
 
 from unbend_service.adapters.codecs import exif
 from unbend_service.adapters.codecs.cameras import camera_name
-from unbend_service.adapters.codecs.jpegs import decode_luma, decode_rgb, encode_packed
+from unbend_service.adapters.codecs.jpegs import decode_luma, decode_rgb, encode_packed, encode_planes
+from unbend_service.adapters.codecs.planar_jpegs import PlanarJpegs
 from unbend_service.adapters.codecs.signatures import announced_size, check_scans, sniff
 from unbend_service.application.ports import Bytes, DecodedImage, ImageHeader, PictureOrigin
 from unbend_service.domain.errors import (
@@ -68,6 +69,7 @@ _RAW_MODES = {
     PixelFormat.BGRA: ("RGBA", "BGRA"),
 }
 _PACKED_ORDERS = {PixelFormat.RGB24: "RGB", PixelFormat.BGR24: "BGR"}
+_JPEG_FORMATS = (*_PACKED_ORDERS, PixelFormat.YUVJ420P)
 _PROFILE_SPACES = {"L": b"GRAY", "RGB": b"RGB ", "RGBA": b"RGB "}
 _LONGEST_SIDE_PX = {"jpeg": 65_500, "png": 2**31 - 1, "webp": 16_383}
 _MAX_JPEG_EXIF_BYTES = 65_533 - 6
@@ -103,6 +105,7 @@ class PillowCodec:
     def __init__(self, settings: Limits) -> None:
         self.source_pixels = settings.source_pixels
         self.animation_frames = settings.animation_frames
+        self._planes = PlanarJpegs()
 
     def probe(self, body: bytes) -> ImageHeader:
         """Reads the header only; raises EmptyBody, UnsupportedMediaType, InvalidImage, TooManyPixels."""
@@ -125,15 +128,18 @@ class PillowCodec:
     def close(self) -> None:
         """Nothing to do."""
 
-    def decode(self, body: bytes, place: Callable[[int], Bytes] | None = None) -> DecodedImage:
+    def decode(self, body: bytes, planes: bool = False, place: Callable[[int], Bytes] | None = None) -> DecodedImage:
         """Raises as :meth:`probe`, ImageTooCostly, and InvalidImage for a broken body.
 
         Args:
+            planes: see ImageCodec.
             place: gives (n,) uint8 memory that the pixels are decoded into, for files where that is possible.
         """
         image_format = sniff(body)
         image = self._open(body, image_format)
         with _translated(image_format):
+            if planes and image_format == "jpeg" and (planar := self._decoded_planes(body, image, place)):
+                return planar
             pixels = decode_rgb(body, place) if image_format == "jpeg" and image.mode == "RGB" else None
             if pixels is None:
                 image.load()
@@ -155,6 +161,27 @@ class PillowCodec:
             icc_profile=profile if _describes(profile, _MODES[frame.pixel_format]) else None,
             upright=method is None,
             chroma_subsampling=_subsampling(image),
+        )
+
+    def _decoded_planes(
+        self, body: bytes, image: Image.Image, place: Callable[[int], Bytes] | None
+    ) -> DecodedImage | None:
+        """An upright 4:2:0 picture of even size as its planes; None if it is none, or they cannot be had."""
+        block = exif.bare(image.info.get("exif") or b"")
+        if _UPRIGHT.get(exif.orientation(block)) is not None or _subsampling(image) != _SUBSAMPLING:
+            return None
+        if any(side % 2 for side in image.size):  # simplejpeg encodes planes of even sizes only
+            return None
+        data = self._planes.decode(body, image.size, place)
+        if data is None:
+            return None
+        profile = _bounded_profile(image)
+        return DecodedImage(
+            Frame(PixelFormat.YUVJ420P, image.width, image.height, data),
+            "jpeg",
+            exif=(exif.upright(block) if 0 < len(block) <= _MAX_EXIF_BYTES else None),
+            icc_profile=profile if _describes(profile, "RGB") else None,
+            chroma_subsampling=_SUBSAMPLING,
         )
 
     def decode_grey(self, body: bytes, longest_px: int) -> Bytes:
@@ -197,8 +224,8 @@ class PillowCodec:
                 f"A picture of {image.frame.width}x{image.frame.height} pixels does not fit into {image_format}.",
                 allowed=f"{_LONGEST_SIDE_PX[image_format]} pixels a side, or png",
             )
-        if image_format == "jpeg" and image.frame.pixel_format in _PACKED_ORDERS:
-            return _encode_packed(image, quality)
+        if image_format == "jpeg" and image.frame.pixel_format in _JPEG_FORMATS:
+            return _encode_jpeg(image, quality)
         picture = _picture(image.frame)
         if image_format == "jpeg":
             picture = _flat(picture)
@@ -333,13 +360,16 @@ def _picture(frame: Frame) -> Image.Image:
     return Image.frombuffer(mode, (frame.width, frame.height), data, "raw", raw_mode, 0, 1)
 
 
-def _encode_packed(image: DecodedImage, quality: int) -> bytes:
+def _encode_jpeg(image: DecodedImage, quality: int) -> bytes:
     metadata = _metadata(image, "jpeg", "RGB")
+    kept = metadata.get("exif"), metadata.get("icc_profile")
     frame = image.frame
+    if frame.pixel_format is PixelFormat.YUVJ420P:
+        return encode_planes(frame.plane_arrays(), quality, *kept)
     pixels = np.ascontiguousarray(frame.data).reshape(frame.height, frame.width, 3)
     order = _PACKED_ORDERS[frame.pixel_format]
     subsampling = image.chroma_subsampling or _SUBSAMPLING
-    return encode_packed(pixels, order, quality, subsampling, metadata.get("exif"), metadata.get("icc_profile"))
+    return encode_packed(pixels, order, quality, subsampling, *kept)
 
 
 def _metadata(image: DecodedImage, image_format: str, mode: str) -> dict[str, bytes]:

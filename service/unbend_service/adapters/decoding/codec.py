@@ -15,6 +15,7 @@ from unbend_service.domain.errors import InvalidImage
 from unbend_service.domain.frames import Frame, PixelFormat, frame_size_bytes
 
 _PIXEL_FORMATS = {kind.value: kind for kind in (PixelFormat.GRAY8, PixelFormat.RGB24, PixelFormat.RGBA)}
+_PLANES = _PIXEL_FORMATS | {PixelFormat.YUVJ420P.value: PixelFormat.YUVJ420P}
 _CAMERA = re.compile(r"exif:[A-Za-z0-9.:+-]{1,160}")
 _CHROMA = (None, "4:4:4", "4:2:2", "4:2:0")
 
@@ -54,13 +55,13 @@ class IsolatedCodec:
             raise _nonsense()
         return PictureOrigin(aspect, camera)
 
-    def decode(self, body: bytes) -> DecodedImage:
+    def decode(self, body: bytes, planes: bool = False) -> DecodedImage:
         """See ImageCodec; raises ImageTooCostly and MemoryFull too."""
         image_format = self._checked(body)
-        verdict = self._pool.work("decode", body)
+        verdict = self._pool.work("decode", body, planes=planes)
         fields, parts = verdict.fields, verdict.parts
         width, height = _size(fields)
-        pixel_format = _PIXEL_FORMATS.get(str(fields.get("pixel_format")))
+        pixel_format = (_PLANES if planes else _PIXEL_FORMATS).get(str(fields.get("pixel_format")))
         lengths = [fields.get(name) for name in ("exif", "icc")]
         kept_bytes = sum(_length(length) for length in lengths)
         part = _length(fields.get("part"))

@@ -99,7 +99,7 @@ class Decoder:
             placed.append(self._memory(size_bytes))
             return placed[-1]
 
-        image = self._codec.decode(body, place)
+        image = self._codec.decode(body, request["planes"], place)
         frame = image.frame
         if not placed or placed[-1].size != frame.data.size:
             place(frame.data.size)

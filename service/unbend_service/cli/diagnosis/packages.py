@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import metadata
 
+from unbend_service.adapters.codecs.planar_jpegs import LIBRARY, PlanarJpegs
 from unbend_service.cli.diagnosis.finding import Finding
 
 #: Their versions are what a bug report needs.
@@ -63,6 +64,14 @@ def examine_versions() -> Iterator[Finding]:
         yield Finding("packages", "bad", detail, "pip install 'unbend[service]'")
     else:
         yield Finding("packages", "ok", ", ".join(found))
+
+
+def examine_turbojpeg() -> Finding:
+    """The library of the system that keeps JPEGs in planes."""
+    if PlanarJpegs().available:
+        return Finding(LIBRARY, "ok", "JPEGs of 4:2:0 stay in planes")
+    detail = "not found; JPEGs go the longer way, through RGB"
+    return Finding(LIBRARY, "note", detail, "apt-get install libturbojpeg0, or the package of your system")
 
 
 def examine_extras() -> Iterator[Finding]:
