@@ -198,6 +198,7 @@ class Client:
         estimate_again: bool = False,
         in_flight: int = 8,
         reconnects: int = 8,
+        frame_deadline_s: float | None = None,
     ) -> Stream:
         """A stream of frames, to be used in a ``with`` block.
 
@@ -220,6 +221,7 @@ class Client:
             estimate_again: estimate anew although the stream id has a grid.
             in_flight: frames that are sent ahead of their answers, at most as many as the server allows.
             reconnects: attempts to mend a broken connection before one of them brings an answer.
+            frame_deadline_s: a frame that is not done so many seconds after the server read it is answered as failed.
 
         Raises:
             InvalidInput: what cannot be sent. Entering the block and iterating raise what the server says.
@@ -240,6 +242,7 @@ class Client:
             estimate_again=estimate_again,
             in_flight=in_flight,
             reconnects=reconnects,
+            frame_deadline_s=frame_deadline_s,
         )
         layout = FrameLayout.of(pixel_format, width, height)
         return Stream(self._channel, self._metadata, layout, options, self._timeout_s, self._shared_memory)

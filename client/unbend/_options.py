@@ -43,3 +43,4 @@ class StreamKeywords(TypedDict, total=False):
     estimate_again: bool
     in_flight: int
     reconnects: int
+    frame_deadline_s: float | None

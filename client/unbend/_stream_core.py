@@ -56,6 +56,7 @@ STATUSES = {
 }
 #: Before the server has ever answered it is not a broken stream that has to be mended, but perhaps a wrong address.
 _ATTEMPTS_TO_OPEN = 3
+_LONGEST_DEADLINE_S = 86_400
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +77,7 @@ class StreamOptions:
     estimate_again: bool = False
     in_flight: int = 8
     reconnects: int = 8
+    frame_deadline_s: float | None = None
 
     def opening(self, layout: FrameLayout) -> correction_pb2.StreamOpen:
         """The first message of the stream. Raises InvalidOption."""
@@ -87,6 +89,10 @@ class StreamOptions:
                 raise InvalidOption(f"{name}={value!r} is not known.", allowed=", ".join(known))
         if self.in_flight < 1:
             raise InvalidOption(f"in_flight={self.in_flight} is out of range.", allowed="1 and more")
+        if self.frame_deadline_s is not None and not 0.001 <= self.frame_deadline_s <= _LONGEST_DEADLINE_S:
+            raise InvalidOption(
+                f"frame_deadline_s={self.frame_deadline_s} is out of range.", allowed=f"0.001..{_LONGEST_DEADLINE_S}"
+            )
         if self.frames is not None and not 1 <= self.frames <= 64:
             raise InvalidOption(f"frames={self.frames} is out of range.", allowed="1..64")
         message = correction_pb2.StreamOpen(
@@ -141,6 +147,7 @@ class StreamCore:
         self._options = options
         self._opening = options.opening(layout)
         self._window = options.in_flight
+        self._deadline_ms = round(1000 * (options.frame_deadline_s or 0))
         self._reconnects = options.reconnects
         self._unanswered: deque[_Sent] = deque()
         self._next_index = 0
@@ -192,8 +199,10 @@ class StreamCore:
         if self._memory is not None:
             sent = self._through(self._memory, self._next_index, timestamp_us, packed.data, packed.shape)
         else:
-            rest = correction_pb2.StreamFrame(index=self._next_index, timestamp_us=timestamp_us).SerializeToString()
-            body = attach(FRAME_FIELD, rest, FRAME_DATA_FIELD, packed.data)
+            rest = correction_pb2.StreamFrame(
+                index=self._next_index, timestamp_us=timestamp_us, deadline_ms=self._deadline_ms
+            )
+            body = attach(FRAME_FIELD, rest.SerializeToString(), FRAME_DATA_FIELD, packed.data)
             sent = _Sent(self._next_index, timestamp_us, body, None, packed.shape)
         self._next_index += 1
         self._unanswered.append(sent)
@@ -203,7 +212,9 @@ class StreamCore:
         self, memory: FrameMemory, index: int, timestamp_us: int, data: Any, shape: tuple[int, ...] | None
     ) -> _Sent:
         places = memory.put(data)
-        frame = correction_pb2.StreamFrame(index=index, timestamp_us=timestamp_us, shared=places)
+        frame = correction_pb2.StreamFrame(
+            index=index, timestamp_us=timestamp_us, shared=places, deadline_ms=self._deadline_ms
+        )
         return _Sent(index, timestamp_us, Request(frame=frame).SerializeToString(), places, shape)
 
     def forget(self) -> None:

@@ -74,6 +74,28 @@ def test_frames_through_shared_memory_are_those_of_the_connection(local: tuple[S
     until_none(server)
 
 
+@pytest.mark.parametrize("sharing", [False, True], ids=["sent", "shared"])
+def test_frames_that_cannot_be_done_in_time_fail_and_leave_the_others_alone(
+    local: tuple[Server, Path], sharing: bool
+) -> None:
+    """A 1080p frame is not drawn within a millisecond; where its answer would have been, nobody draws any more."""
+    server, path = local
+    frames = [np.full((1620, 1920), level, np.uint8) for level in range(100, 112)]
+    points = np.linspace(-0.9, 0.9, 9)
+    lens = unbend.Grid(np.stack(np.meshgrid(points, points), axis=-1))
+    with unbend.Client(server.grpc, shared_memory=path if sharing else None) as client:
+        record = client.grids.put(lens)
+        for seconds, status in ((0.001, "failed"), (60.0, "corrected"), (None, "corrected")):
+            with client.stream(1920, 1080, "i420", grid=record, fit="keep", frame_deadline_s=seconds) as stream:
+                results = [(r.index, str(r.status), r.error, r.image) for r in stream.correct(frames)]
+            assert [result[:2] for result in results] == [(index, status) for index in range(12)]
+            for (_, _, error, image), frame in zip(results, frames, strict=True):
+                if status == "failed":
+                    assert isinstance(error, unbend.DeadlineExceeded)
+                else:
+                    np.testing.assert_array_equal(image, frame)
+
+
 def test_of_a_client_that_is_killed_nothing_is_left(local: tuple[Server, Path]) -> None:
     """No descriptor, no mapping, nothing in /dev/shm; the service goes on."""
     server, path = local

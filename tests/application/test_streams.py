@@ -39,6 +39,7 @@ from unbend_service.application.stream_messages import (
 )
 from unbend_service.application.streams import Streams
 from unbend_service.domain.errors import (
+    DeadlineExceeded,
     Draining,
     FoldedGrid,
     GridNotFound,
@@ -73,6 +74,8 @@ class UnsteadyPool(FakeRenderPool):
     most_under_way: int = 0
     failures: dict[int, list[Exception]] = field(default_factory=dict)
     gate: asyncio.Event | None = None
+    stuck: set[int] = field(default_factory=set)
+    given_up: int = 0
     chance: random.Random = field(default_factory=lambda: random.Random(7))
 
     async def render(
@@ -85,17 +88,31 @@ class UnsteadyPool(FakeRenderPool):
         deadline_s: float | None = None,
         shared: SharedPicture | None = None,
     ) -> np.ndarray:
+        if deadline_s is not None and deadline_s <= 0:
+            raise DeadlineExceeded("The deadline had passed before the frame was accepted.")
         self.under_way += 1
         self.most_under_way = max(self.most_under_way, self.under_way)
         try:
             await asyncio.sleep(self.chance.uniform(0, self.longest_s))
             if self.gate is not None:
                 await self.gate.wait()
+            if int(frame.data[0]) in self.stuck:
+                await self._stay(deadline_s)
             if errors := self.failures.get(int(frame.data[0])):
                 raise errors.pop(0)
             return await super().render(frame, grid, border, affinity=affinity, deadline_s=deadline_s, shared=shared)
         finally:
             self.under_way -= 1
+
+    async def _stay(self, deadline_s: float | None) -> None:
+        try:
+            async with asyncio.timeout(deadline_s):
+                await asyncio.Event().wait()
+        except TimeoutError:
+            raise DeadlineExceeded("The frame was not rendered in time.") from None
+        except asyncio.CancelledError:
+            self.given_up += 1
+            raise
 
 
 @dataclass
@@ -446,6 +463,68 @@ async def test_a_stream_of_broken_frames_only_ends_without_a_grid(build: Build) 
         events = await build().collect(StreamConfig(SMALL, while_estimating=while_estimating), broken())
         assert statuses(events) == ["failed"] * 20
         assert grids(events) == []
+
+
+async def test_a_frame_that_is_not_drawn_within_its_deadline_fails_alone_and_in_its_turn(build: Build) -> None:
+    """The pool keeps the time while it draws: it is told what is left, and nobody takes the frame from it."""
+    bench = build()
+    bench.pool.stuck = {2}
+
+    async def hurried() -> AsyncIterator[StreamFrame]:
+        async for frame in frames(5):
+            yield dataclasses.replace(frame, deadline_s=0.05 if frame.index == 2 else 60.0)
+
+    events = await bench.collect(StreamConfig(SMALL, grid_source=await stored(bench)), hurried())
+
+    assert [result.index for result in results(events)] == list(range(5))
+    assert statuses(events) == ["corrected", "corrected", "failed", "corrected", "corrected"]
+    error = results(events)[2].error
+    assert isinstance(error, DeadlineExceeded)
+    assert "0.05 s that the client gave" in str(error)
+    assert bench.pool.given_up == 0
+    assert bench.meter.frames["failed"] == 1
+
+
+async def test_a_deadline_holds_while_a_frame_waits_for_the_grid(build: Build) -> None:
+    """The first frame has passed away before the others come; it was looked at all the same."""
+    bench = build()
+    events: list[StreamEvent] = []
+
+    async def late() -> AsyncIterator[StreamFrame]:
+        yield dataclasses.replace(frame_of(0), deadline_s=0.05)
+        await eventually(lambda: bool(results(events)))
+        yield frame_of(1)
+        yield frame_of(2)
+
+    await bench.collect(StreamConfig(SMALL, options=KEEP_GOING, grid_source=EstimateOver(3)), late(), into=events)
+
+    assert statuses(events) == ["failed", "corrected", "corrected"]
+    assert isinstance(results(events)[0].error, DeadlineExceeded)
+    assert len(grids(events)) == 1
+
+
+async def test_a_deadline_counts_from_the_reading_of_a_frame(build: Build) -> None:
+    """Also where a newer one may take its place: the time that it waits for a worker is its own."""
+    bench = build()
+    bench.pool.gate = asyncio.Event()
+    bench.pool.longest_s = 0
+    config = StreamConfig(SMALL, grid_source=await stored(bench), delivery=Delivery.LATEST)
+
+    async def hurried() -> AsyncIterator[StreamFrame]:
+        for index in range(3):
+            yield dataclasses.replace(frame_of(index), deadline_s=0.1 if index == 2 else None)
+        await asyncio.sleep(0.2)
+        bench.pool.gate.set()
+
+    events = await bench.collect(config, hurried())
+
+    assert statuses(events) == ["corrected", "corrected", "failed"]
+
+
+async def stored(bench: Bench) -> StoredGrid:
+    record = GridRecord(Grid.from_map(barrel_guides()))
+    await bench.store.put(record)
+    return StoredGrid(record.id)
 
 
 async def test_a_frame_that_kills_workers_fails_alone(build: Build) -> None:

@@ -294,6 +294,8 @@ def test_a_frame_that_kills_workers_fails_with_its_error(server: Server, client:
         ({"pixel_format": "gray8", "delivery": "pigeon"}, unbend.InvalidOption),
         ({"pixel_format": "gray8", "while_estimating": "sleep"}, unbend.InvalidOption),
         ({"pixel_format": "gray8", "in_flight": 0}, unbend.InvalidOption),
+        ({"pixel_format": "gray8", "frame_deadline_s": 0.0}, unbend.InvalidOption),
+        ({"pixel_format": "gray8", "frame_deadline_s": float("nan")}, unbend.InvalidOption),
     ],
 )
 def test_a_stream_that_cannot_be_is_refused_when_it_is_opened(

@@ -27,19 +27,19 @@ from unbend.v1 import grid_pb2 as unbend_dot_v1_dot_grid__pb2
 from unbend.v1 import memory_pb2 as unbend_dot_v1_dot_memory__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1aunbend/v1/correction.proto\x12\tunbend.v1\x1a\x15unbend/v1/frame.proto\x1a\x14unbend/v1/grid.proto\x1a\x16unbend/v1/memory.proto\"\x94\x02\n\x0e\x43orrectRequest\x12&\n\x06\x66ormat\x18\x01 \x01(\x0b\x32\x16.unbend.v1.FrameFormat\x12\x0c\n\x04\x64\x61ta\x18\x02 \x01(\x0c\x12#\n\x07\x63orrect\x18\x03 \x01(\x0e\x32\x12.unbend.v1.Correct\x12\'\n\trendering\x18\x04 \x01(\x0b\x32\x14.unbend.v1.Rendering\x12\x0f\n\x07grid_id\x18\x05 \x01(\t\x12\x1b\n\x0emin_confidence\x18\x06 \x01(\x01H\x00\x88\x01\x01\x12-\n\ranswer_format\x18\x07 \x01(\x0e\x32\x16.unbend.v1.PixelFormat\x12\x0e\n\x06\x63\x61mera\x18\x08 \x01(\tB\x11\n\x0f_min_confidence\"n\n\x0f\x43orrectResponse\x12&\n\x06\x66ormat\x18\x01 \x01(\x0b\x32\x16.unbend.v1.FrameFormat\x12\x0c\n\x04\x64\x61ta\x18\x02 \x01(\x0c\x12%\n\x06record\x18\x03 \x01(\x0b\x32\x15.unbend.v1.GridRecord\"q\n\x14\x43orrectStreamRequest\x12%\n\x04open\x18\x01 \x01(\x0b\x32\x15.unbend.v1.StreamOpenH\x00\x12\'\n\x05\x66rame\x18\x02 \x01(\x0b\x32\x16.unbend.v1.StreamFrameH\x00\x42\t\n\x07message\"\xb0\x03\n\nStreamOpen\x12\x11\n\tstream_id\x18\x01 \x01(\t\x12&\n\x06\x66ormat\x18\x02 \x01(\x0b\x32\x16.unbend.v1.FrameFormat\x12#\n\x07\x63orrect\x18\x03 \x01(\x0e\x32\x12.unbend.v1.Correct\x12\'\n\trendering\x18\x04 \x01(\x0b\x32\x14.unbend.v1.Rendering\x12-\n\x08\x65stimate\x18\x05 \x01(\x0b\x32\x19.unbend.v1.EstimateFramesH\x00\x12\x11\n\x07grid_id\x18\x06 \x01(\tH\x00\x12#\n\x06guides\x18\x07 \x01(\x0b\x32\x11.unbend.v1.GuidesH\x00\x12\x34\n\x10while_estimating\x18\x08 \x01(\x0e\x32\x1a.unbend.v1.WhileEstimating\x12%\n\x08\x64\x65livery\x18\t \x01(\x0e\x32\x13.unbend.v1.Delivery\x12\x1b\n\x0emin_confidence\x18\n \x01(\x01H\x01\x88\x01\x01\x12\x16\n\x0e\x65stimate_again\x18\x0b \x01(\x08\x42\r\n\x0bgrid_sourceB\x11\n\x0f_min_confidence\" \n\x0e\x45stimateFrames\x12\x0e\n\x06\x66rames\x18\x01 \x01(\r\"j\n\x0bStreamFrame\x12\r\n\x05index\x18\x01 \x01(\x04\x12\x14\n\x0ctimestamp_us\x18\x02 \x01(\x03\x12\x0c\n\x04\x64\x61ta\x18\x03 \x01(\x0c\x12(\n\x06shared\x18\x04 \x01(\x0b\x32\x18.unbend.v1.SharedPicture\"\x9f\x01\n\x15\x43orrectStreamResponse\x12)\n\x06opened\x18\x01 \x01(\x0b\x32\x17.unbend.v1.StreamOpenedH\x00\x12%\n\x04grid\x18\x02 \x01(\x0b\x32\x15.unbend.v1.StreamGridH\x00\x12)\n\x06result\x18\x03 \x01(\x0b\x32\x17.unbend.v1.StreamResultH\x00\x42\t\n\x07message\"I\n\x0cStreamOpened\x12\x11\n\tstream_id\x18\x01 \x01(\t\x12\x0f\n\x07resumed\x18\x02 \x01(\x08\x12\x15\n\rmax_in_flight\x18\x03 \x01(\r\"3\n\nStreamGrid\x12%\n\x06record\x18\x01 \x01(\x0b\x32\x15.unbend.v1.GridRecord\"\xb9\x01\n\x0cStreamResult\x12\r\n\x05index\x18\x01 \x01(\x04\x12\x14\n\x0ctimestamp_us\x18\x02 \x01(\x03\x12&\n\x06status\x18\x03 \x01(\x0e\x32\x16.unbend.v1.FrameStatus\x12\x0c\n\x04\x64\x61ta\x18\x04 \x01(\x0c\x12$\n\x05\x65rror\x18\x05 \x01(\x0b\x32\x15.unbend.v1.FrameError\x12(\n\x06shared\x18\x06 \x01(\x0b\x32\x18.unbend.v1.SharedPicture\"+\n\nFrameError\x12\x0c\n\x04\x63ode\x18\x01 \x01(\t\x12\x0f\n\x07message\x18\x02 \x01(\t*q\n\x0fWhileEstimating\x12 \n\x1cWHILE_ESTIMATING_UNSPECIFIED\x10\x00\x12\x19\n\x15WHILE_ESTIMATING_HOLD\x10\x01\x12!\n\x1dWHILE_ESTIMATING_PASS_THROUGH\x10\x02*P\n\x08\x44\x65livery\x12\x18\n\x14\x44\x45LIVERY_UNSPECIFIED\x10\x00\x12\x15\n\x11\x44\x45LIVERY_LOSSLESS\x10\x01\x12\x13\n\x0f\x44\x45LIVERY_LATEST\x10\x02*\x9b\x01\n\x0b\x46rameStatus\x12\x1c\n\x18\x46RAME_STATUS_UNSPECIFIED\x10\x00\x12\x1a\n\x16\x46RAME_STATUS_CORRECTED\x10\x01\x12\x1f\n\x1b\x46RAME_STATUS_PASSED_THROUGH\x10\x02\x12\x18\n\x14\x46RAME_STATUS_DROPPED\x10\x03\x12\x17\n\x13\x46RAME_STATUS_FAILED\x10\x04\x32\xad\x01\n\x11\x43orrectionService\x12@\n\x07\x43orrect\x12\x19.unbend.v1.CorrectRequest\x1a\x1a.unbend.v1.CorrectResponse\x12V\n\rCorrectStream\x12\x1f.unbend.v1.CorrectStreamRequest\x1a .unbend.v1.CorrectStreamResponse(\x01\x30\x01\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1aunbend/v1/correction.proto\x12\tunbend.v1\x1a\x15unbend/v1/frame.proto\x1a\x14unbend/v1/grid.proto\x1a\x16unbend/v1/memory.proto\"\x94\x02\n\x0e\x43orrectRequest\x12&\n\x06\x66ormat\x18\x01 \x01(\x0b\x32\x16.unbend.v1.FrameFormat\x12\x0c\n\x04\x64\x61ta\x18\x02 \x01(\x0c\x12#\n\x07\x63orrect\x18\x03 \x01(\x0e\x32\x12.unbend.v1.Correct\x12\'\n\trendering\x18\x04 \x01(\x0b\x32\x14.unbend.v1.Rendering\x12\x0f\n\x07grid_id\x18\x05 \x01(\t\x12\x1b\n\x0emin_confidence\x18\x06 \x01(\x01H\x00\x88\x01\x01\x12-\n\ranswer_format\x18\x07 \x01(\x0e\x32\x16.unbend.v1.PixelFormat\x12\x0e\n\x06\x63\x61mera\x18\x08 \x01(\tB\x11\n\x0f_min_confidence\"n\n\x0f\x43orrectResponse\x12&\n\x06\x66ormat\x18\x01 \x01(\x0b\x32\x16.unbend.v1.FrameFormat\x12\x0c\n\x04\x64\x61ta\x18\x02 \x01(\x0c\x12%\n\x06record\x18\x03 \x01(\x0b\x32\x15.unbend.v1.GridRecord\"q\n\x14\x43orrectStreamRequest\x12%\n\x04open\x18\x01 \x01(\x0b\x32\x15.unbend.v1.StreamOpenH\x00\x12\'\n\x05\x66rame\x18\x02 \x01(\x0b\x32\x16.unbend.v1.StreamFrameH\x00\x42\t\n\x07message\"\xb0\x03\n\nStreamOpen\x12\x11\n\tstream_id\x18\x01 \x01(\t\x12&\n\x06\x66ormat\x18\x02 \x01(\x0b\x32\x16.unbend.v1.FrameFormat\x12#\n\x07\x63orrect\x18\x03 \x01(\x0e\x32\x12.unbend.v1.Correct\x12\'\n\trendering\x18\x04 \x01(\x0b\x32\x14.unbend.v1.Rendering\x12-\n\x08\x65stimate\x18\x05 \x01(\x0b\x32\x19.unbend.v1.EstimateFramesH\x00\x12\x11\n\x07grid_id\x18\x06 \x01(\tH\x00\x12#\n\x06guides\x18\x07 \x01(\x0b\x32\x11.unbend.v1.GuidesH\x00\x12\x34\n\x10while_estimating\x18\x08 \x01(\x0e\x32\x1a.unbend.v1.WhileEstimating\x12%\n\x08\x64\x65livery\x18\t \x01(\x0e\x32\x13.unbend.v1.Delivery\x12\x1b\n\x0emin_confidence\x18\n \x01(\x01H\x01\x88\x01\x01\x12\x16\n\x0e\x65stimate_again\x18\x0b \x01(\x08\x42\r\n\x0bgrid_sourceB\x11\n\x0f_min_confidence\" \n\x0e\x45stimateFrames\x12\x0e\n\x06\x66rames\x18\x01 \x01(\r\"\x7f\n\x0bStreamFrame\x12\r\n\x05index\x18\x01 \x01(\x04\x12\x14\n\x0ctimestamp_us\x18\x02 \x01(\x03\x12\x0c\n\x04\x64\x61ta\x18\x03 \x01(\x0c\x12(\n\x06shared\x18\x04 \x01(\x0b\x32\x18.unbend.v1.SharedPicture\x12\x13\n\x0b\x64\x65\x61\x64line_ms\x18\x05 \x01(\r\"\x9f\x01\n\x15\x43orrectStreamResponse\x12)\n\x06opened\x18\x01 \x01(\x0b\x32\x17.unbend.v1.StreamOpenedH\x00\x12%\n\x04grid\x18\x02 \x01(\x0b\x32\x15.unbend.v1.StreamGridH\x00\x12)\n\x06result\x18\x03 \x01(\x0b\x32\x17.unbend.v1.StreamResultH\x00\x42\t\n\x07message\"I\n\x0cStreamOpened\x12\x11\n\tstream_id\x18\x01 \x01(\t\x12\x0f\n\x07resumed\x18\x02 \x01(\x08\x12\x15\n\rmax_in_flight\x18\x03 \x01(\r\"3\n\nStreamGrid\x12%\n\x06record\x18\x01 \x01(\x0b\x32\x15.unbend.v1.GridRecord\"\xb9\x01\n\x0cStreamResult\x12\r\n\x05index\x18\x01 \x01(\x04\x12\x14\n\x0ctimestamp_us\x18\x02 \x01(\x03\x12&\n\x06status\x18\x03 \x01(\x0e\x32\x16.unbend.v1.FrameStatus\x12\x0c\n\x04\x64\x61ta\x18\x04 \x01(\x0c\x12$\n\x05\x65rror\x18\x05 \x01(\x0b\x32\x15.unbend.v1.FrameError\x12(\n\x06shared\x18\x06 \x01(\x0b\x32\x18.unbend.v1.SharedPicture\"+\n\nFrameError\x12\x0c\n\x04\x63ode\x18\x01 \x01(\t\x12\x0f\n\x07message\x18\x02 \x01(\t*q\n\x0fWhileEstimating\x12 \n\x1cWHILE_ESTIMATING_UNSPECIFIED\x10\x00\x12\x19\n\x15WHILE_ESTIMATING_HOLD\x10\x01\x12!\n\x1dWHILE_ESTIMATING_PASS_THROUGH\x10\x02*P\n\x08\x44\x65livery\x12\x18\n\x14\x44\x45LIVERY_UNSPECIFIED\x10\x00\x12\x15\n\x11\x44\x45LIVERY_LOSSLESS\x10\x01\x12\x13\n\x0f\x44\x45LIVERY_LATEST\x10\x02*\x9b\x01\n\x0b\x46rameStatus\x12\x1c\n\x18\x46RAME_STATUS_UNSPECIFIED\x10\x00\x12\x1a\n\x16\x46RAME_STATUS_CORRECTED\x10\x01\x12\x1f\n\x1b\x46RAME_STATUS_PASSED_THROUGH\x10\x02\x12\x18\n\x14\x46RAME_STATUS_DROPPED\x10\x03\x12\x17\n\x13\x46RAME_STATUS_FAILED\x10\x04\x32\xad\x01\n\x11\x43orrectionService\x12@\n\x07\x43orrect\x12\x19.unbend.v1.CorrectRequest\x1a\x1a.unbend.v1.CorrectResponse\x12V\n\rCorrectStream\x12\x1f.unbend.v1.CorrectStreamRequest\x1a .unbend.v1.CorrectStreamResponse(\x01\x30\x01\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'unbend.v1.correction_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_WHILEESTIMATING']._serialized_start=1716
-  _globals['_WHILEESTIMATING']._serialized_end=1829
-  _globals['_DELIVERY']._serialized_start=1831
-  _globals['_DELIVERY']._serialized_end=1911
-  _globals['_FRAMESTATUS']._serialized_start=1914
-  _globals['_FRAMESTATUS']._serialized_end=2069
+  _globals['_WHILEESTIMATING']._serialized_start=1737
+  _globals['_WHILEESTIMATING']._serialized_end=1850
+  _globals['_DELIVERY']._serialized_start=1852
+  _globals['_DELIVERY']._serialized_end=1932
+  _globals['_FRAMESTATUS']._serialized_start=1935
+  _globals['_FRAMESTATUS']._serialized_end=2090
   _globals['_CORRECTREQUEST']._serialized_start=111
   _globals['_CORRECTREQUEST']._serialized_end=387
   _globals['_CORRECTRESPONSE']._serialized_start=389
@@ -51,17 +51,17 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_ESTIMATEFRAMES']._serialized_start=1051
   _globals['_ESTIMATEFRAMES']._serialized_end=1083
   _globals['_STREAMFRAME']._serialized_start=1085
-  _globals['_STREAMFRAME']._serialized_end=1191
-  _globals['_CORRECTSTREAMRESPONSE']._serialized_start=1194
-  _globals['_CORRECTSTREAMRESPONSE']._serialized_end=1353
-  _globals['_STREAMOPENED']._serialized_start=1355
-  _globals['_STREAMOPENED']._serialized_end=1428
-  _globals['_STREAMGRID']._serialized_start=1430
-  _globals['_STREAMGRID']._serialized_end=1481
-  _globals['_STREAMRESULT']._serialized_start=1484
-  _globals['_STREAMRESULT']._serialized_end=1669
-  _globals['_FRAMEERROR']._serialized_start=1671
-  _globals['_FRAMEERROR']._serialized_end=1714
-  _globals['_CORRECTIONSERVICE']._serialized_start=2072
-  _globals['_CORRECTIONSERVICE']._serialized_end=2245
+  _globals['_STREAMFRAME']._serialized_end=1212
+  _globals['_CORRECTSTREAMRESPONSE']._serialized_start=1215
+  _globals['_CORRECTSTREAMRESPONSE']._serialized_end=1374
+  _globals['_STREAMOPENED']._serialized_start=1376
+  _globals['_STREAMOPENED']._serialized_end=1449
+  _globals['_STREAMGRID']._serialized_start=1451
+  _globals['_STREAMGRID']._serialized_end=1502
+  _globals['_STREAMRESULT']._serialized_start=1505
+  _globals['_STREAMRESULT']._serialized_end=1690
+  _globals['_FRAMEERROR']._serialized_start=1692
+  _globals['_FRAMEERROR']._serialized_end=1735
+  _globals['_CORRECTIONSERVICE']._serialized_start=2093
+  _globals['_CORRECTIONSERVICE']._serialized_end=2266
 # @@protoc_insertion_point(module_scope)

@@ -342,12 +342,18 @@ class StreamFrame(_message.Message):
     TIMESTAMP_US_FIELD_NUMBER: _builtins.int
     DATA_FIELD_NUMBER: _builtins.int
     SHARED_FIELD_NUMBER: _builtins.int
+    DEADLINE_MS_FIELD_NUMBER: _builtins.int
     index: _builtins.int
     """Chosen by the client, strictly increasing within a connection; comes back with the result."""
     timestamp_us: _builtins.int
     """Presentation time in microseconds, any origin; comes back with the result."""
     data: _builtins.bytes
     """The picture, in the layout of the stream; empty with shared."""
+    deadline_ms: _builtins.int
+    """Milliseconds, counted from when the server has read the frame, after which its answer is of no use; 0 means none. A
+    frame that is not done by then, whatever it waits for, fails with deadline_exceeded, and is not worked on any more.
+    Its answer keeps its place in the order of the frames.
+    """
     @_builtins.property
     def shared(self) -> _memory_pb2.SharedPicture:
         """Instead of data, in streams of a raw format: the picture lies in shared memory, and so will its answer."""
@@ -359,10 +365,11 @@ class StreamFrame(_message.Message):
         timestamp_us: _builtins.int = ...,
         data: _builtins.bytes = ...,
         shared: _memory_pb2.SharedPicture | None = ...,
+        deadline_ms: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["shared", b"shared"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["data", b"data", "index", b"index", "shared", b"shared", "timestamp_us", b"timestamp_us"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["data", b"data", "deadline_ms", b"deadline_ms", "index", b"index", "shared", b"shared", "timestamp_us", b"timestamp_us"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -164,12 +164,12 @@ class Correction:
         border: Border,
         *,
         affinity: str | None = None,
+        deadline_s: float | None = None,
         shared: SharedPicture | None = None,
     ) -> Bytes:
         """The picture of a fitted grid, (frame_size_bytes,) uint8; counts nothing, so that it may be tried again."""
-        return await self._pool.render(
-            frame, grid, border, affinity=affinity, deadline_s=self._deadline_s, shared=shared
-        )
+        limit_s = self._deadline_s if deadline_s is None else min(deadline_s, self._deadline_s)
+        return await self._pool.render(frame, grid, border, affinity=affinity, deadline_s=limit_s, shared=shared)
 
     async def encode(self, image: DecodedImage, image_format: str, options: CorrectOptions) -> bytes:
         """The file of a picture, jpeg, png or webp."""

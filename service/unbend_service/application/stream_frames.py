@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +22,7 @@ from unbend_service.application.stream_messages import (
     WhileEstimating,
 )
 from unbend_service.application.turns import Turns
-from unbend_service.domain.errors import BodyTooLarge, InvalidFrame, Unavailable, UnbendError
+from unbend_service.domain.errors import BodyTooLarge, DeadlineExceeded, InvalidFrame, Unavailable, UnbendError
 from unbend_service.domain.frames import Frame, frame_size_bytes
 from unbend_service.domain.grid import Grid
 from unbend_service.settings import Settings
@@ -51,12 +52,22 @@ class FrameAnswers:
     regions: Regions
     settings: Settings
 
-    async def of_frame(self, frame: StreamFrame, fixed: FixedGrid | None) -> StreamResult:
+    async def of_frame(self, frame: StreamFrame, fixed: FixedGrid | None, end_s: float | None = None) -> StreamResult:
         """The answer to a frame that was started when the grid was ``fixed`` (None: not yet).
 
-        An error of the frame is an answer. Raised are errors of the stream: the grid is impossible, or nothing can be
-        rendered any more (Unavailable).
+        An error of the frame is an answer, and so is that it was not done at ``end_s`` of the loop's clock. Raised are
+        errors of the stream: the grid is impossible, or nothing can be rendered any more (Unavailable).
         """
+        limit = asyncio.timeout_at(end_s)
+        try:
+            async with limit:
+                return await self._answered(frame, fixed, limit)
+        except TimeoutError:
+            if not limit.expired():
+                raise
+            return self._failed(frame, _too_late(frame))
+
+    async def _answered(self, frame: StreamFrame, fixed: FixedGrid | None, limit: asyncio.Timeout) -> StreamResult:
         try:
             picture = await self._picture(frame, fixed)
         except Unavailable:
@@ -71,9 +82,13 @@ class FrameAnswers:
                 np.copyto(picture.shared.target, picture.shared.source)
             return self._answer(frame, FrameStatus.PASSED_THROUGH, frame.data)
         try:
-            data = await self._corrected(picture, fixed.fitted)
+            data = await self._corrected(picture, fixed.fitted, limit)
         except Unavailable:
             raise
+        except DeadlineExceeded as error:
+            end_s = limit.when()
+            late = end_s is not None and asyncio.get_running_loop().time() >= end_s
+            return self._failed(frame, _too_late(frame) if late else error)
         except UnbendError as error:
             return self._failed(frame, error)
         self.meter.frame("corrected")
@@ -133,12 +148,9 @@ class FrameAnswers:
             raise InvalidFrame(f"A {image.image_format} file in a stream of {image_format} files.")
         return image
 
-    async def _corrected(self, picture: _Picture, grid: Grid) -> bytes | Bytes:
-        frame, image, border = picture.frame, picture.image, self.config.options.border
-        data = await self.turns.run(
-            self.stream_id,
-            lambda: self.correction.draw(frame, grid, border, affinity=self.stream_id, shared=picture.shared),
-        )
+    async def _corrected(self, picture: _Picture, grid: Grid, limit: asyncio.Timeout) -> bytes | Bytes:
+        frame, image = picture.frame, picture.image
+        data = await self.turns.run(self.stream_id, lambda: self._drawn(picture, grid, limit))
         if image is None:
             return data
         drawn = replace(image, frame=replace(frame, data=data))
@@ -146,6 +158,27 @@ class FrameAnswers:
             self.stream_id, lambda: self.correction.encode(drawn, drawn.image_format, self.config.options)
         )
 
+    async def _drawn(self, picture: _Picture, grid: Grid, limit: asyncio.Timeout) -> Bytes:
+        end_s = limit.when()
+        left_s = None if end_s is None else end_s - asyncio.get_running_loop().time()
+        # the pool keeps the time meanwhile: it knows when nobody draws in the client's memory any more
+        limit.reschedule(None)
+        try:
+            return await self.correction.draw(
+                picture.frame,
+                grid,
+                self.config.options.border,
+                affinity=self.stream_id,
+                deadline_s=left_s,
+                shared=picture.shared,
+            )
+        finally:
+            limit.reschedule(end_s)
+
     def _failed(self, frame: StreamFrame, error: UnbendError) -> StreamResult:
         self.meter.frame("failed")
         return StreamResult(frame.index, frame.timestamp_us, FrameStatus.FAILED, error=error)
+
+
+def _too_late(frame: StreamFrame) -> DeadlineExceeded:
+    return DeadlineExceeded(f"The frame was not done within the {frame.deadline_s:g} s that the client gave it.")

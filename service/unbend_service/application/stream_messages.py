@@ -161,12 +161,14 @@ class StreamFrame:
         timestamp_us: presentation time in microseconds, any origin; comes back with the result.
         data: the picture, in the layout of the stream; empty with ``shared``.
         shared: where the picture lies in the memory of the client, if it does.
+        deadline_s: seconds after which nobody wants the answer, counted from the reading of the frame; None: no end.
     """
 
     index: int
     timestamp_us: int
     data: bytes | memoryview
     shared: SharedPlaces | None = None
+    deadline_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,12 +26,13 @@ _DROPPED_AT_MOST = 1024
 
 @dataclass(slots=True, eq=False)
 class _Entry:
-    """A frame that is not answered yet. ``answer`` is set exactly once."""
+    """A frame that is not answered yet. ``answer`` is set exactly once; nobody wants it after ``end_s`` of the loop."""
 
     index: int
     timestamp_us: int
     answer: asyncio.Future[StreamResult]
     frame: StreamFrame | None
+    end_s: float | None = None
     size_bytes: int = 0
     started: bool = False
 
@@ -170,8 +171,10 @@ class StreamSession:
         return True
 
     def _accept(self, frame: StreamFrame) -> None:
-        answer: asyncio.Future[StreamResult] = asyncio.get_running_loop().create_future()
-        entry = _Entry(frame.index, frame.timestamp_us, answer, frame, len(frame.data))
+        loop = asyncio.get_running_loop()
+        answer: asyncio.Future[StreamResult] = loop.create_future()
+        end_s = None if frame.deadline_s is None else loop.time() + frame.deadline_s
+        entry = _Entry(frame.index, frame.timestamp_us, answer, frame, end_s, len(frame.data))
         self._held_bytes += entry.size_bytes
         self.memory.take(entry.size_bytes)
         self._unanswered += 1
@@ -230,7 +233,7 @@ class StreamSession:
         frame, entry.frame = entry.frame, None
         assert frame is not None
         try:
-            result = await self.answers.of_frame(frame, fixed)
+            result = await self.answers.of_frame(frame, fixed, entry.end_s)
         except asyncio.CancelledError:
             entry.answer.cancel()
             raise

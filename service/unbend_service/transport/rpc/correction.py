@@ -157,7 +157,8 @@ def _to_stream_frame(message: correction_pb2.StreamFrame, data: bytes | memoryvi
         if message.HasField("shared")
         else None
     )
-    return StreamFrame(message.index, message.timestamp_us, data, places)
+    deadline_s = message.deadline_ms / 1000 if message.deadline_ms else None
+    return StreamFrame(message.index, message.timestamp_us, data, places, deadline_s)
 
 
 def write_response(event: Response | StreamEvent) -> bytes:
