@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from training.picture_commands import add_branch_verbs
+from training.together_commands import add_together_verbs
 from training.vgg_commands import add_verbs as add_vgg_verbs
 
 if TYPE_CHECKING:
@@ -99,6 +100,7 @@ def _parser() -> argparse.ArgumentParser:
     for verb in (export, calibrate):
         verb.add_argument("--branch", help="checkpoint of the picture branch to go with it")
     add_branch_verbs(verbs)
+    add_together_verbs(verbs)
 
     evaluate = verbs.add_parser("evaluate", help="measure exported weights, or a checkpoint, on validation pictures")
     evaluate.add_argument("--weights", type=Path, help="an exported .onnx; otherwise --name's checkpoint is exported")

@@ -7,9 +7,11 @@ Training warps these points, never images. One .npz holds everything: points as 
 from __future__ import annotations
 
 import csv
+import multiprocessing
 import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from multiprocessing.pool import Pool
 from pathlib import Path
 
 import cv2
@@ -29,8 +31,11 @@ QUANTUM = 32767.0
 SHORTEST_SIDE_PX = 200
 LONGEST_SIDE_PX = 1000
 DRAWN = "drawn"
-FREE_SOURCES = ("facades_spb",)
-"""Photographs under CC0; the licences of the others are in the photographs' SOURCES.md."""
+FREE_SOURCES = (
+    "facades_spb", "gcompris", "gcompris_more", "kphotoalbum_demo", "libjxl_testdata", "lomiri_wallpapers",
+    "lxqt_themes", "palapeli", "plasma_wallpapers", "scikit_image", "scikit_learn", "scratch", "tuxpaint_templates",
+)  # fmt: skip
+"""Photographs under CC0 or the free licences of Debian packages; each licence is in its folder's SOURCES.md."""
 
 
 @dataclass(frozen=True)
@@ -67,11 +72,13 @@ class ChainStore:
             return ChainStore(**{name: file[name] for name in file.files})
 
 
-def training_photographs(folder: Path, sources: tuple[str, ...] | None = None) -> Iterator[Picture]:
-    """(source, grey uint8 picture) of every photograph whose split is `train` in the folder's index.csv, of the
-    named sources or of all."""
+def training_photographs(
+    folder: Path, sources: tuple[str, ...] | None = None, split: str = "train"
+) -> Iterator[Picture]:
+    """(source, grey uint8 picture) of every photograph of that split in the folder's index.csv, of the named sources
+    or of all."""
     with open(folder / "index.csv", newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["split"] == "train"]
+        rows = [row for row in csv.DictReader(file) if row["split"] == split]
     for row in rows:
         if sources is not None and row["source"] not in sources:
             continue
@@ -80,26 +87,54 @@ def training_photographs(folder: Path, sources: tuple[str, ...] | None = None) -
             yield row["source"], np.asarray(grey, np.uint8)
 
 
-def drawn_scenes(count: int, seed: int) -> Iterator[Picture]:
+def drawn_scenes(count: int, seed: int, processes: int = 1) -> Iterator[Picture]:
     """(DRAWN, grey uint8 picture) of `count` scenes."""
-    for index in range(count):
-        yield DRAWN, draw_scene(np.random.default_rng([seed, index]))
+    numbers = [(seed, index) for index in range(count)]
+    if processes == 1:
+        yield from map(_drawn, numbers)
+        return
+    with _forked(processes) as pool:
+        yield from pool.imap(_drawn, numbers, chunksize=4)
 
 
-def build_store(pictures: Iterable[Picture]) -> ChainStore:
+def _forked(processes: int) -> Pool:
+    cv2.setNumThreads(1)  # a fork waits for OpenCV's threads for ever
+    return multiprocessing.get_context("fork").Pool(processes)
+
+
+def _drawn(number: tuple[int, int]) -> Picture:
+    return DRAWN, draw_scene(np.random.default_rng(number))
+
+
+def build_store(pictures: Iterable[Picture], processes: int = 1) -> ChainStore:
     """Extracts the chains of all pictures at all levels."""
+    if processes == 1:
+        return _stored(map(_searched, pictures))
+    with _forked(processes) as pool:
+        return _stored(pool.imap(_searched, pictures, chunksize=4))
+
+
+def _searched(picture: Picture) -> tuple[str, tuple[int, int], list[EdgeChains]]:
+    """The source and size of a picture, and its chains at each level."""
+    source, grey = picture
+    shrink = min(1.0, LONGEST_SIDE_PX / max(grey.shape))
+    height, width = (round(side * shrink) for side in grey.shape)
+    extracted = []
+    for level in LEVELS:
+        size = (max(16, round(width * level)), max(16, round(height * level)))
+        enlarging = size[0] > grey.shape[1]
+        scaled = cv2.resize(grey, size, interpolation=cv2.INTER_LINEAR if enlarging else cv2.INTER_AREA)
+        extracted.append(extract(np.asarray(scaled, np.uint8)))
+    return source, (width, height), extracted
+
+
+def _stored(searched: Iterable[tuple[str, tuple[int, int], list[EdgeChains]]]) -> ChainStore:
     extracted: list[EdgeChains] = []
     sizes: list[tuple[int, int]] = []
     sources: list[str] = []
-    for source, grey in pictures:
-        shrink = min(1.0, LONGEST_SIDE_PX / max(grey.shape))
-        height, width = (round(side * shrink) for side in grey.shape)
-        for level in LEVELS:
-            size = (max(16, round(width * level)), max(16, round(height * level)))
-            enlarging = size[0] > grey.shape[1]
-            scaled = cv2.resize(grey, size, interpolation=cv2.INTER_LINEAR if enlarging else cv2.INTER_AREA)
-            extracted.append(extract(np.asarray(scaled, np.uint8)))
-        sizes.append((width, height))
+    for source, size, chains in searched:
+        extracted += chains
+        sizes.append(size)
         sources.append(source)
     lengths = [len(chains.x) for chains in extracted]
 

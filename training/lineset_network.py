@@ -170,18 +170,18 @@ class LinesetNetwork(nn.Module):
         return torch.relu(self.embed_second(torch.relu(self.embed_first(normed))))
 
     def _told(self, values: Tensor, features: Tensor, layout: Layout) -> Tensor:
-        with torch.no_grad(), torch.autocast("cpu", enabled=False):
+        with torch.no_grad(), torch.autocast(values.device.type, enabled=False):
             told: Tensor = self.straightening(layout.spread(self.straightening.curves(values)), features)
             return told
 
     def _estimate(self, state: Tensor, before: list[Tensor]) -> Tensor:
-        with torch.autocast("cpu", enabled=False):
+        with torch.autocast(state.device.type, enabled=False):
             change: Tensor = self.heads[len(before)](state.float()) @ self.basis.t()
             # Each refinement answers for its own correction; the estimate it started from has a loss of its own.
             return (before[-1].detach() if before else self.straight) + change
 
     def _spreads(self, state: Tensor, values: Tensor, layout: Layout) -> Tensor:
-        with torch.autocast("cpu", enabled=False):
+        with torch.autocast(state.device.type, enabled=False):
             chains = torch.log1p(layout.mask.sum(1, keepdim=True)) * 0.25
             known = [state.float().detach(), (values - self.straight).detach() * 4, chains]
             spreads: Tensor = self.spread_head(torch.cat(known, 1))

@@ -41,7 +41,7 @@ def _node_basis(at: Tensor) -> tuple[Tensor, Tensor]:
     """Node basis and its derivative at `at` (...): both (..., nodes)."""
     powers = torch.stack([at**k for k in range(len(NODES))], -1)
     slopes = torch.stack([k * at ** max(k - 1, 0) for k in range(len(NODES))], -1)
-    matrix = torch.tensor(_NODE_POWERS, dtype=at.dtype)
+    matrix = torch.tensor(_NODE_POWERS, dtype=at.dtype, device=at.device)
     return powers @ matrix, slopes @ matrix
 
 
@@ -62,7 +62,7 @@ class Truth:
         self._at_y, self._slope_y = _node_basis(self._y)
         self._tangents = _homography_tangents(s, t, slopes)
         weighted = self._tangents * torch.cat([self._share, self._share], 1)[..., None]
-        normal = weighted.transpose(1, 2) @ self._tangents + 1e-5 * torch.eye(8)
+        normal = weighted.transpose(1, 2) @ self._tangents + 1e-5 * torch.eye(8, device=source.device)
         self._project = torch.linalg.solve(normal, weighted.transpose(1, 2))
 
     def misses(self, values: Tensor) -> Tensor:
@@ -94,7 +94,7 @@ def _homography_tangents(s: Tensor, t: Tensor, slopes: Tensor) -> Tensor:
     They ought to go through the Jacobian of the estimated map, which lies between that of doing nothing and the true
     one (a pincushion's residual, measured after a real alignment, exceeds what the true Jacobian leaves by half).
     """
-    slopes = (2 / 3) * torch.eye(2) + (1 / 3) * slopes
+    slopes = (2 / 3) * torch.eye(2, device=slopes.device) + (1 / 3) * slopes
     zero, one = torch.zeros_like(s), torch.ones_like(s)
     in_s = torch.stack([one, zero, s, zero, t, zero, s * s, s * t], -1)
     in_t = torch.stack([zero, one, zero, s, zero, t, s * t, t * t], -1)

@@ -267,10 +267,13 @@ def _report(run: BranchRun, sums: dict[str, dict[int, list[float]]], samples_per
     return json.dumps(line)
 
 
-def new_branch_checkpoint(lineset: LinesetNetwork, first: Path | None, notes: dict[str, Any]) -> BranchCheckpoint:
+def new_branch_checkpoint(
+    lineset: LinesetNetwork, first: Path | None, notes: dict[str, Any], shape: BranchShape | None = None
+) -> BranchCheckpoint:
     """Step zero: random weights, or those of the first network where they fit."""
     torch.manual_seed(int(notes.get("seed", 0)))
-    branch = PictureBranch(BranchShape(state=lineset.shape.global_width), lineset.basis.clone())
+    shape = shape or BranchShape(state=lineset.shape.global_width)
+    branch = PictureBranch(shape, lineset.basis.clone())
     if first is not None:
         from training.picture_start import begin_with_first
 

@@ -28,7 +28,10 @@ ERRORS = 2
 
 @dataclass(frozen=True)
 class BranchShape:
-    """Sizes; the first ones are those of the first network, whose weights the branch may begin with."""
+    """Sizes; the first ones are those of the first network, whose weights the branch may begin with.
+
+    depth: residual blocks at the coarsest scale.
+    """
 
     harmonics: int = 6
     widths: tuple[int, int, int] = (32, 64, 96)
@@ -37,6 +40,7 @@ class BranchShape:
     hidden: int = 256
     state: int = 256
     fusion: int = 320
+    depth: int = 2
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -75,7 +79,7 @@ class OrientationFront(nn.Module):
 
 def _inside(extent: Tensor, cells: int) -> Tensor:
     """(B, 1, cells, cells): 1 where a cell lies inside the picture with both neighbours."""
-    centres = (2 * torch.arange(cells, dtype=torch.float32) + 1) / cells - 1
+    centres = (2 * torch.arange(cells, dtype=torch.float32, device=extent.device) + 1) / cells - 1
     across, down = extent[:, :1] - 2 / cells, extent[:, 1:] - 2 / cells
     # A picture that fills the view has no border of its own making.
     across, down = across + (extent[:, :1] > 0.999) * 0.1, down + (extent[:, 1:] > 0.999) * 0.1
@@ -109,7 +113,7 @@ class PictureBranch(nn.Module):
         self.trunk = nn.Sequential(
             nn.Conv2d(2 + 2 * shape.harmonics, one, 3, 1, 1), nn.ReLU(), _Residual(one),
             nn.Conv2d(one, two, 3, 2, 1), nn.ReLU(), _Residual(two),
-            nn.Conv2d(two, three, 3, 2, 1), nn.ReLU(), _Residual(three), _Residual(three),
+            nn.Conv2d(two, three, 3, 2, 1), nn.ReLU(), *(_Residual(three) for _ in range(shape.depth)),
             nn.Conv2d(three, shape.narrow, 1), nn.ReLU(),
         )  # fmt: skip
         self.register_buffer("pool", _pooling(12, shape.summary))
@@ -139,7 +143,7 @@ class PictureBranch(nn.Module):
         pool = self.pool.to(maps.dtype)
         summary = (pool @ maps @ pool.t()).flatten(1)
         hidden = torch.relu(self.summarise(summary))
-        with torch.autocast("cpu", enabled=False):
+        with torch.autocast(view.device.type, enabled=False):
             hidden = hidden.float()
             own = self.straight + self.guides(torch.cat([hidden, 1 - extent], 1))
             said = (values - self.straight) @ self.inverse_basis.t()

@@ -18,6 +18,7 @@ from training.homographies import natural_tilts
 from training.imperfection import FlatPoints, at_the_right_level, found, jitter
 from training.labels import evaluation_points, evaluation_weights, fit_labels
 from training.random_distortions import draw_distortions
+from training.view_specs import ViewSpecs, view_specs
 from training.windows import Windows, columns, draw_half_extents, draw_windows, target_view
 from unbend_service.adapters.estimators.chain_features import ChainDescriptions, ChainPoints, describe
 
@@ -56,26 +57,41 @@ class Sampler:
     """Draws batches from a store; all randomness comes from the generator passed in."""
 
     def __init__(
-        self, store: ChainStore, drawn_share: float = 0.22, tilt_share: float = 0.1, square_share: float = 0.5
+        self,
+        store: ChainStore,
+        drawn_share: float = 0.22,
+        tilt_share: float = 0.1,
+        square_share: float = 0.5,
+        sources: tuple[str, ...] | None = None,
     ) -> None:
+        """sources: of the photographs to draw from; None for all. Drawn scenes are always among the pictures."""
         self._store = store
         self._x = store.x.astype(np.float32) / np.float32(QUANTUM)
         self._y = store.y.astype(np.float32) / np.float32(QUANTUM)
         self._strength = store.strength.astype(np.float32)
         drawn = store.source == DRAWN
-        self._drawn, self._photographs = np.flatnonzero(drawn), np.flatnonzero(~drawn)
+        wanted = ~drawn if sources is None else np.isin(store.source, sources)
+        self._drawn, self._photographs = np.flatnonzero(drawn), np.flatnonzero(wanted)
         self._drawn_share = drawn_share if len(self._photographs) else 1.0
         self._tilt_share = tilt_share
         self._square_share = square_share
 
     def draw(self, size: int, rng: np.random.Generator, kinds: Ints | None = None) -> TrainingBatch:
         """A batch of `size` samples."""
+        return self.draw_with_views(size, rng, kinds)[0]
+
+    def draw_with_views(
+        self, size: int, rng: np.random.Generator, kinds: Ints | None = None
+    ) -> tuple[TrainingBatch, ViewSpecs]:
+        """A batch of `size` samples, and what it takes to see the pictures that their chains are of."""
         distortions = draw_distortions(size, rng, kinds)
         half_extent = draw_half_extents(size, self._square_share, rng)
-        points = self._points(distortions, half_extent, rng)
-        return with_truth(points, distortions, half_extent)
+        points, windows, tilts = self._points(distortions, half_extent, rng)
+        return with_truth(points, distortions, half_extent), view_specs(distortions, half_extent, windows, tilts)
 
-    def _points(self, distortions: DistortionBatch, half_extent: Float64, rng: np.random.Generator) -> ChainPoints:
+    def _points(
+        self, distortions: DistortionBatch, half_extent: Float64, rng: np.random.Generator
+    ) -> tuple[ChainPoints, Windows, Float64]:
         low, high, stretch = target_view(distortions, half_extent)
         picture = self._pick(distortions.size, rng)
         windows = draw_windows(picture, self._store.size_px[picture], low, high, rng)
@@ -96,7 +112,7 @@ class Sampler:
         inner_x, inner_y = columns(half_extent - UNSEARCHED_BORDER_PX * windows.pixel[:, None])
         visible &= (np.abs(x) < inner_x[points.sample]) & (np.abs(y) < inner_y[points.sample])
         seen = points.moved(x, y).kept(visible).by_sample()
-        return ChainPoints(
+        chains = ChainPoints(
             x=seen.x,
             y=seen.y,
             strength=seen.strength,
@@ -105,6 +121,7 @@ class Sampler:
             half_extent=half_extent.astype(np.float32),
             pixel=windows.pixel,
         )
+        return chains, windows, tilts
 
     def _pick(self, size: int, rng: np.random.Generator) -> Ints:
         if not len(self._drawn):

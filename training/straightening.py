@@ -109,7 +109,7 @@ class Straightening(nn.Module):
 def _across(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Offsets (..., SAMPLES) of points across the line through them, reference pixels; cos and sin (..., 1) of its
     direction, read as `chain_features` reads it."""
-    steps = torch.linspace(-1, 1, SAMPLES)
+    steps = torch.linspace(-1, 1, SAMPLES, device=x.device)
     from_x, from_y = x - x.mean(-1, keepdim=True), y - y.mean(-1, keepdim=True)
     run, rise = (from_x * steps).sum(-1, keepdim=True), (from_y * steps).sum(-1, keepdim=True)
     length = torch.sqrt(run * run + rise * rise + 1e-12)

@@ -1,0 +1,152 @@
+"""`python -m training pack` and `together`: both networks at once, on a GPU beside many cores."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import torch
+
+    from training.drawing import Drawn
+    from training.picture_pack import PicturePack
+    from training.together import TogetherRun
+
+TRAINING, HELD_OUT = "", "-held-out"
+_HELD_OUT_BATCHES = {"imitated": 512, "extracted": 192}
+
+
+def add_together_verbs(verbs: Any) -> None:
+    """Adds both verbs to the parser of `training`."""
+    pack = verbs.add_parser("pack", help="chains and pictures of all photographs and drawn scenes, for `together`")
+    pack.add_argument("--scenes", type=int, default=900, help="drawn scenes to add")
+    pack.add_argument("--more-photos", type=Path, action="append", default=[], help="a further folder of photographs")
+    pack.add_argument("--processes", type=int, default=os.cpu_count() or 1)
+    pack.set_defaults(verb=_pack)
+    together = verbs.add_parser("together", help="train both networks at once, or go on with it")
+    together.add_argument("--name", default="together")
+    together.add_argument("--source", action="append", help="photographs to learn from; all if none is named")
+    together.add_argument("--minutes", type=float, required=True)
+    together.add_argument("--rates", type=float, nargs=2, default=(1.0, 1.0), help="first and last share of the rate")
+    together.add_argument("--imitated", type=int, default=6, help="processes that warp chains")
+    together.add_argument("--extracted", type=int, default=0, help="processes that warp pictures and search them")
+    together.add_argument("--batch-size", type=int, default=256)
+    together.add_argument("--extracted-batch-size", type=int, default=128)
+    together.add_argument("--drawn-share", type=float, default=0.22)
+    together.add_argument("--chain-width", type=int, default=192)
+    together.add_argument("--device", default="cuda")
+    together.add_argument("--seed", type=int, default=0)
+    together.set_defaults(verb=_together)
+
+
+def _pack(arguments: argparse.Namespace) -> None:
+    from training.chain_store import build_store, drawn_scenes, training_photographs
+    from training.picture_pack import PicturePack
+
+    folders = [arguments.photos, *arguments.more_photos]
+    taken = itertools.chain.from_iterable(training_photographs(folder) for folder in folders)
+    drawn = drawn_scenes(arguments.scenes, seed=1, processes=arguments.processes)
+    for suffix, pictures in (
+        (HELD_OUT, list(training_photographs(arguments.photos, split="val"))),
+        (TRAINING, list(itertools.chain(taken, drawn))),
+    ):
+        PicturePack.of(pictures).save(arguments.directory / f"pictures{suffix}.npz")
+        build_store(pictures, arguments.processes).save(arguments.directory / f"chains{suffix}.npz")
+        print(f"{len(pictures)} pictures{suffix}", flush=True)
+
+
+def _together(arguments: argparse.Namespace) -> None:
+    import torch
+
+    from training.atlas import Atlas
+    from training.chain_store import ChainStore
+    from training.drawing import Draw, Drawing, extracted, imitated
+    from training.picture_pack import PicturePack
+    from training.picture_sampler import PictureSampler
+    from training.sampler import Sampler
+    from training.together import train_together
+
+    directory: Path = arguments.directory
+    sources = None if arguments.source is None else tuple(arguments.source)
+    pack = PicturePack.load(directory / "pictures.npz")
+    store = ChainStore.load(directory / "chains.npz")
+    sampler = Sampler(store, drawn_share=arguments.drawn_share, sources=sources)
+    draws: list[Draw] = [imitated(sampler, arguments.batch_size)] * arguments.imitated
+    if arguments.extracted:
+        chosen = pack.only(sources, arguments.drawn_share)
+        draws += [extracted(PictureSampler(chosen), arguments.extracted_batch_size)] * arguments.extracted
+    begun = (directory / f"{arguments.name}-branch.pt").exists()
+    checkpoint = None if begun else _begun(sampler, arguments)
+    held_out_pack = PicturePack.load(directory / "pictures-held-out.npz")
+    held_out = _held_out(directory, held_out_pack, len(pack.pictures))
+    # The processes that draw are forked before anything touches the GPU.
+    run_step = 0 if checkpoint is not None else _step(directory, arguments.name)
+    drawing = Drawing(draws, arguments.seed * 1_000_003 + run_step)
+    device = torch.device(arguments.device)
+    if device.type == "cuda":
+        torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = True
+    run = _run(checkpoint, directory, arguments, device)
+    atlas = Atlas([*pack.pictures, *held_out_pack.pictures], device)
+    train_together(
+        run, drawing, atlas, held_out, directory,
+        name=arguments.name, minutes=arguments.minutes, rates=tuple(arguments.rates),
+    )  # fmt: skip
+    drawing.stop()
+
+
+def _begun(sampler: Any, arguments: argparse.Namespace) -> Any:
+    from dataclasses import replace
+
+    from training.loop import default_shape, new_checkpoint
+
+    shape = replace(default_shape(), chain_width=arguments.chain_width)
+    return new_checkpoint(sampler, shape, arguments.seed)
+
+
+def _step(directory: Path, name: str) -> int:
+    from training.picture_loop import BranchCheckpoint
+
+    return BranchCheckpoint.load(directory / f"{name}-branch.pt").step
+
+
+def _run(checkpoint: Any, directory: Path, arguments: argparse.Namespace, device: torch.device) -> TogetherRun:
+    from training.checkpoints import Checkpoint
+    from training.picture_loop import BranchCheckpoint, new_branch_checkpoint
+    from training.picture_network import BranchShape
+    from training.together import TogetherRecipe, TogetherRun
+
+    name = arguments.name
+    if checkpoint is None:
+        checkpoint = Checkpoint.load(directory / f"{name}.pt")
+        branch = BranchCheckpoint.load(directory / f"{name}-branch.pt")
+    else:
+        notes = {"seed": arguments.seed, "lineset": name, "sources": arguments.source}
+        checkpoint.notes.update(sources=arguments.source)
+        shape = BranchShape(state=checkpoint.shape.global_width, widths=(32, 64, 128), hidden=320, depth=3)
+        branch = new_branch_checkpoint(checkpoint.averaged_network(), None, notes, shape)
+    return TogetherRun(checkpoint, branch, TogetherRecipe(), device, arguments.seed)
+
+
+def _held_out(directory: Path, pack: PicturePack, first: int) -> list[Drawn]:
+    """Batches of pictures that nobody learns from: chains imitated, and extracted. first: their index in the atlas."""
+    import numpy as np
+
+    from training.chain_store import ChainStore
+    from training.drawing import Drawn, batch_tensors, extracted, imitated
+    from training.picture_sampler import PictureSampler
+    from training.sampler import Sampler
+
+    sampler = Sampler(ChainStore.load(directory / "chains-held-out.npz"))
+    batches = []
+    for draw in (
+        imitated(sampler, _HELD_OUT_BATCHES["imitated"]),
+        extracted(PictureSampler(pack.pictures), _HELD_OUT_BATCHES["extracted"]),
+    ):
+        batch, seen = draw(np.random.default_rng(99))
+        if "view_picture" in seen:
+            seen["view_picture"] = seen["view_picture"] + first
+        batches.append(Drawn({**batch_tensors(batch), **seen}, process=0, number=0, again=False))
+    return batches
