@@ -5,6 +5,8 @@ own answer and from the first and the second look; the branch and the fusion hea
 to know of the chains may shape the line-set network's state, but not its answer.
 """
 
+# mypy: disallow-untyped-decorators=False
+# (types are also checked where torch is not installed)
 from __future__ import annotations
 
 import json
@@ -242,13 +244,15 @@ def _report(run: TogetherRun, sums: dict[str, list[Tensor]], samples_per_s: floa
 def _loaded(checkpoint: Checkpoint, state: dict[str, Tensor], device: torch.device) -> LinesetNetwork:
     network = LinesetNetwork(checkpoint.shape)
     network.load_state_dict(state)
-    return network.to(device)
+    network.to(device)
+    return network
 
 
 def _loaded_branch(checkpoint: BranchCheckpoint, state: dict[str, Tensor], device: torch.device) -> PictureBranch:
     branch = PictureBranch(checkpoint.shape, state["basis"])
     branch.load_state_dict(state)
-    return branch.to(device, memory_format=torch.channels_last)
+    branch.to(device, memory_format=torch.channels_last)
+    return branch
 
 
 def _optimiser(

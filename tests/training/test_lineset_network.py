@@ -83,7 +83,7 @@ def test_packed_and_padded_chains_give_the_same_guides() -> None:
     mask = torch.tensor([[1.0, 1, 1, 0], [1, 0, 0, 0]])
     features = torch.randn(2, 4, FEATURES) * mask[..., None]
     place = mask.flatten().nonzero()[:, 0]
-    padded, _ = network(features, mask)
+    padded, _, _ = network(features, mask)
     packed, _ = network.estimates(features.reshape(8, -1)[place], Layout(mask, place, place // 4))
     assert padded.shape == (2, VALUES)
     torch.testing.assert_close(padded, packed[-1], atol=1e-5, rtol=1e-4)
