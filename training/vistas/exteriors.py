@@ -61,7 +61,7 @@ def canyon(raster: Raster, rng: np.random.Generator) -> None:
     buildings.street(road, 60, half * 1.2, rng)
     for bearing, side in ((math.pi / 2, -1.0), (-math.pi / 2, 1.0)):
         z = -span(rng, 0, 4)
-        while z < 40:
+        while z < 30:
             wide = span(rng, 6, 16)
             start = z if side < 0 else z + wide
             buildings.front(Site.facing(raster, (side * half, 0.0, start), bearing), wide, int(rng.integers(1, 6)), rng)

@@ -201,7 +201,7 @@ def shelf(site: Site, length: float, height: float, rng: np.random.Generator) ->
             break
         at, fill, tidy = 0.04, span(rng, 0.3, 1), bool(rng.random() < 0.6)
         while at < length - 0.1:
-            wide = span(rng, 0.02, 0.07) if tidy else span(rng, 0.05, 0.25)
+            wide = span(rng, 0.025, 0.09) if tidy else span(rng, 0.06, 0.25)
             tall = gap * span(rng, 0.4, 0.85)
             if rng.random() < fill:
                 label = goods[int(rng.integers(2))] if rng.random() < 0.15 else plain(span(rng, 0, 1))

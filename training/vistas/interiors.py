@@ -106,7 +106,7 @@ def kitchen(raster: Raster, rng: np.random.Generator) -> None:
 
 def aisle(raster: Raster, rng: np.random.Generator) -> None:
     """Between shelves: a shop, a library, a store."""
-    half, depth, height = span(rng, 0.9, 2.2), span(rng, 5, 14), span(rng, 2.6, 5)
+    half, depth, height = span(rng, 0.9, 2.2), span(rng, 4, 9), span(rng, 2.6, 5)
     walls = _room(raster, rng, half + 0.5, depth, height)
     tall = span(rng, 1.5, min(2.8, height))
     for wall, length in zip(walls, (depth, 2 * half, depth), strict=True):

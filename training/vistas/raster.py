@@ -79,10 +79,11 @@ class Raster:
         if len(outline) < 3:
             return
         focal = self.camera.focal_px
-        points = np.stack([outline[:, 0], -outline[:, 1]], 1) / outline[:, 2:] * focal + self._centre
+        points = outline[:, :2] / outline[:, 2:] * (focal, -focal) + self._centre
         height, width = self.tone.shape
-        left, top = np.maximum(np.floor(points.min(0)), 0).astype(int).tolist()
-        right, bottom = (int(n) for n in np.minimum(np.ceil(points.max(0)) + 1, (width, height)))
+        (x0, y0), (x1, y1) = points.min(0).tolist(), points.max(0).tolist()
+        left, top = max(math.floor(x0), 0), max(math.floor(y0), 0)
+        right, bottom = min(math.ceil(x1) + 1, width), min(math.ceil(y1) + 1, height)
         if right <= left or bottom <= top:
             return
         grid = np.round((points - (left, top)).clip(-_FARTHEST_PX, _FARTHEST_PX) * (1 << _SUBPIXEL_BITS))
@@ -91,7 +92,7 @@ class Raster:
         # 1 / z of the plane normal . p = facing, at the ray through a pixel: affine in the picture
         u = (np.arange(left, right) - self._centre[0]) * (normal[0] / focal / facing)
         v = (self._centre[1] - np.arange(top, bottom)) * (normal[1] / focal / facing) + normal[2] / facing
-        nearness = (v[:, None] + u[None, :]).astype(np.float32)
+        nearness = v.astype(np.float32)[:, None] + u.astype(np.float32)
         part = slice(top, bottom), slice(left, right)
         visible = (inside > 0) & (nearness > self.nearness[part])
         if not visible.any():
@@ -99,10 +100,10 @@ class Raster:
         shade = tone * self._shade(normal if facing < 0 else -normal)
         small = min(right - left, bottom - top) < _SMALLEST_TEXTURED_PX
         if material.flat or (small and material.cover is None):
-            self.tone[part][visible] = shade * material.mean
+            np.copyto(self.tone[part], np.float32(shade * material.mean), where=visible)
         else:
             scale = np.linalg.norm(seen[1] - seen[0]) if stretched else material.size_m
-            depth = float(np.exp(np.log(outline[:, 2]).mean()))
+            depth = math.sqrt(float(outline[:, 2].min() * outline[:, 2].max()))
             level = material.level(focal * float(scale) / depth)
             drawn = self._warped(level[0], seen, material, stretched, (left, top, right, bottom))
             if level[1] is not None:

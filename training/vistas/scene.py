@@ -58,17 +58,17 @@ def _lit(raster: Raster, rng: np.random.Generator, indoors: bool) -> Float32:
 
 def _photographed(tone: Float32, nearness: Float32, rng: np.random.Generator) -> Bytes:
     """Defocus by depth, the lens's and the sensor's blur, tone curve, grain, and often JPEG."""
-    sigma = float(rng.uniform(0.5, 1.6)) if rng.random() < 0.7 else float(rng.uniform(1.6, 3))
-    sharp = cv2.GaussianBlur(tone, (0, 0), sigma)
+    sigma = float(rng.uniform(0.3, 0.8)) if rng.random() < 0.7 else float(rng.uniform(0.8, 1.5))
     size = (WIDTH_PX, HEIGHT_PX)
-    grey_tones = np.asarray(cv2.resize(sharp, size, interpolation=cv2.INTER_AREA), np.float32)
+    shrunk = cv2.resize(tone, size, interpolation=cv2.INTER_AREA)
+    grey_tones = np.asarray(cv2.GaussianBlur(shrunk, (0, 0), sigma), np.float32)
     if rng.random() < 0.25:
         focus, spread = float(np.median(nearness)), float(rng.uniform(2, 8))
         apart = np.abs(cv2.resize(nearness, size, interpolation=cv2.INTER_AREA) - focus) / max(focus, 0.05)
         soft = cv2.GaussianBlur(grey_tones, (0, 0), spread)
         share = cv2.GaussianBlur((apart * float(rng.uniform(0.3, 1.5))).clip(0, 1), (0, 0), 1.5)
         grey_tones = grey_tones + share * (soft - grey_tones)
-    low, high = np.percentile(grey_tones, (1, 99))
+    low, high = np.percentile(grey_tones[::4, ::4], (1, 99))
     stretched = (grey_tones - low) / max(float(high - low), 0.05) * float(rng.uniform(0.75, 1.1)) + float(
         rng.uniform(0, 0.1)
     )
