@@ -56,6 +56,7 @@ def _parser() -> argparse.ArgumentParser:
 
     store = verbs.add_parser("store", help="extract the chains of all training pictures, once")
     store.add_argument("--scenes", type=int, default=900, help="drawn scenes to add")
+    store.add_argument("--vistas", type=int, default=0, help="drawn scenes with furniture, plants and people to add")
     store.add_argument("--free-only", action="store_true", help="drawn scenes and CC0 photographs only")
     store.set_defaults(verb=_store)
 
@@ -63,6 +64,7 @@ def _parser() -> argparse.ArgumentParser:
     scenes.add_argument("folder", type=Path)
     scenes.add_argument("--count", type=int, default=100)
     scenes.add_argument("--seed", type=int, default=99, help="1 and 7 are those of the training runs")
+    scenes.add_argument("--vistas", action="store_true", help="with furniture, plants and people")
     scenes.set_defaults(verb=_scenes)
 
     train = verbs.add_parser("train", help="start the long run, or go on with it")
@@ -113,10 +115,15 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _store(arguments: argparse.Namespace) -> None:
+    from training import vistas
     from training.chain_store import FREE_SOURCES, build_store, drawn_scenes, training_photographs
 
     sources = FREE_SOURCES if arguments.free_only else None
-    pictures = chain(training_photographs(arguments.photos, sources), drawn_scenes(arguments.scenes, seed=1))
+    pictures = chain(
+        training_photographs(arguments.photos, sources),
+        drawn_scenes(arguments.scenes, seed=1),
+        drawn_scenes(arguments.vistas, seed=1, draw=vistas.draw_scene),
+    )
     store = build_store(pictures)
     store.save(arguments.directory / "chains.npz")
     print(f"{store.pictures} pictures, {len(store.x)} points -> {arguments.directory / 'chains.npz'}")
@@ -125,10 +132,12 @@ def _store(arguments: argparse.Namespace) -> None:
 def _scenes(arguments: argparse.Namespace) -> None:
     import cv2
 
+    from training import scenes, vistas
     from training.chain_store import drawn_scenes
 
     arguments.folder.mkdir(parents=True, exist_ok=True)
-    for number, (_, grey) in enumerate(drawn_scenes(arguments.count, arguments.seed)):
+    draw = vistas.draw_scene if arguments.vistas else scenes.draw_scene
+    for number, (_, grey) in enumerate(drawn_scenes(arguments.count, arguments.seed, draw=draw)):
         cv2.imwrite(str(arguments.folder / f"{number:04}.png"), grey)
 
 

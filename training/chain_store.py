@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import multiprocessing
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from multiprocessing.pool import Pool
 from pathlib import Path
@@ -24,6 +24,7 @@ from unbend_service.adapters.estimators.chains import EdgeChains, extract
 Float32 = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int64]
 Picture = tuple[str, npt.NDArray[np.uint8]]
+DrawScene = Callable[[np.random.Generator], npt.NDArray[np.uint8]]
 
 LEVELS = (1.3333, 1.0, 0.75, 0.55, 0.4)
 """Scales at which each picture is searched; the first stands for pictures that were enlarged, as small crops are."""
@@ -87,9 +88,9 @@ def training_photographs(
             yield row["source"], np.asarray(grey, np.uint8)
 
 
-def drawn_scenes(count: int, seed: int, processes: int = 1) -> Iterator[Picture]:
-    """(DRAWN, grey uint8 picture) of `count` scenes."""
-    numbers = [(seed, index) for index in range(count)]
+def drawn_scenes(count: int, seed: int, processes: int = 1, draw: DrawScene = draw_scene) -> Iterator[Picture]:
+    """(DRAWN, grey uint8 picture) of `count` scenes, drawn by `scenes.draw_scene` or by `vistas.draw_scene`."""
+    numbers = [(draw, seed, index) for index in range(count)]
     if processes == 1:
         yield from map(_drawn, numbers)
         return
@@ -102,8 +103,9 @@ def _forked(processes: int) -> Pool:
     return multiprocessing.get_context("fork").Pool(processes)
 
 
-def _drawn(number: tuple[int, int]) -> Picture:
-    return DRAWN, draw_scene(np.random.default_rng(number))
+def _drawn(number: tuple[DrawScene, int, int]) -> Picture:
+    draw, *seed = number
+    return DRAWN, draw(np.random.default_rng(seed))
 
 
 def build_store(pictures: Iterable[Picture], processes: int = 1) -> ChainStore:

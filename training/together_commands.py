@@ -23,6 +23,7 @@ def add_together_verbs(verbs: Any) -> None:
     """Adds both verbs to the parser of `training`."""
     pack = verbs.add_parser("pack", help="chains and pictures of all photographs and drawn scenes, for `together`")
     pack.add_argument("--scenes", type=int, default=900, help="drawn scenes to add")
+    pack.add_argument("--vistas", type=int, default=0, help="drawn scenes with furniture, plants and people to add")
     pack.add_argument("--more-photos", type=Path, action="append", default=[], help="a further folder of photographs")
     pack.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     pack.set_defaults(verb=_pack)
@@ -43,12 +44,16 @@ def add_together_verbs(verbs: Any) -> None:
 
 
 def _pack(arguments: argparse.Namespace) -> None:
+    from training import vistas
     from training.chain_store import build_store, drawn_scenes, training_photographs
     from training.picture_pack import PicturePack
 
     folders = [arguments.photos, *arguments.more_photos]
     taken = itertools.chain.from_iterable(training_photographs(folder) for folder in folders)
-    drawn = drawn_scenes(arguments.scenes, seed=1, processes=arguments.processes)
+    drawn = itertools.chain(
+        drawn_scenes(arguments.scenes, seed=1, processes=arguments.processes),
+        drawn_scenes(arguments.vistas, seed=1, processes=arguments.processes, draw=vistas.draw_scene),
+    )
     for suffix, pictures in (
         (HELD_OUT, list(training_photographs(arguments.photos, split="val"))),
         (TRAINING, list(itertools.chain(taken, drawn))),

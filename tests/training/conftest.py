@@ -8,7 +8,7 @@ import pytest
 
 # Most of these tests need the training dependency group, which the service's own environment does not have.
 _TRAINS = bool(find_spec("torch") and find_spec("onnx"))
-_NUMPY_ALONE = {"test_annotations.py"}
+_NUMPY_ALONE = {"test_annotations.py", "test_vistas.py"}
 collect_ignore = (
     [] if _TRAINS else [f.name for f in Path(__file__).parent.glob("test_*.py") if f.name not in _NUMPY_ALONE]
 )

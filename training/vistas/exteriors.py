@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from training.vistas import buildings
+from training.vistas import buildings, grounds
 from training.vistas.materials import FLOORS, any_of, ground, plain, span
 from training.vistas.raster import Raster
 from training.vistas.silhouettes import bush, car, people, tree
@@ -16,11 +16,12 @@ from training.vistas.sites import Site
 def suburb(raster: Raster, rng: np.random.Generator) -> None:
     """Gabled houses behind lawns, fences, trees, cars."""
     road = Site.facing(raster, (0.0, 0.0, span(rng, 2, 7)), math.pi)
-    buildings.street(road, 40, span(rng, 3, 7), rng) if rng.random() < 0.6 else road.face(
-        [(-60, 0, -60), (60, 0, -60), (60, 0, 60), (-60, 0, 60)], ground(rng)
-    )
+    if rng.random() < 0.6:
+        grounds.street(road, 40, span(rng, 3, 7), rng)
+    else:
+        road.face([(-60, 0, -60), (60, 0, -60), (60, 0, 60), (-60, 0, 60)], ground(rng))
     if rng.random() < 0.35:
-        buildings.path(Site.facing(raster, (span(rng, -3, 2), 0.0, 0.0), math.pi), span(rng, 0.8, 3), rng)
+        grounds.path(Site.facing(raster, (span(rng, -3, 2), 0.0, 0.0), math.pi), span(rng, 0.8, 3), rng)
     x = -span(rng, 5, 14)
     while x < 12:
         wide, front = span(rng, 5, 13), span(rng, 7, 16)
@@ -32,7 +33,7 @@ def suburb(raster: Raster, rng: np.random.Generator) -> None:
         )
         x += wide + span(rng, 1, 6)
     if rng.random() < 0.6:
-        buildings.fence(
+        grounds.fence(
             Site.facing(raster, (-span(rng, 2, 12), 0.0, span(rng, 4, 8)), math.pi + span(rng, -0.3, 0.3)),
             span(rng, 4, 16),
             rng,
@@ -44,7 +45,7 @@ def fronts(raster: Raster, rng: np.random.Generator) -> None:
     """Town houses across the street."""
     distance, x = span(rng, 5, 16), -span(rng, 6, 22)
     road = Site.facing(raster, (0.0, 0.0, distance - span(rng, 1.5, 4)), math.pi)
-    buildings.street(road, 40, span(rng, 3, 8), rng)
+    grounds.street(road, 40, span(rng, 3, 8), rng)
     while x < 18:
         wide = span(rng, 5, 16)
         buildings.front(
@@ -58,7 +59,7 @@ def canyon(raster: Raster, rng: np.random.Generator) -> None:
     """Along a street between town houses."""
     half = span(rng, 3, 9)
     road = Site.facing(raster, (half * 0.6, 0.0, 0.0), -math.pi / 2)
-    buildings.street(road, 60, half * 1.2, rng)
+    grounds.street(road, 60, half * 1.2, rng)
     for bearing, side in ((math.pi / 2, -1.0), (-math.pi / 2, 1.0)):
         z = -span(rng, 0, 4)
         while z < 30:
@@ -82,10 +83,10 @@ def steps(raster: Raster, rng: np.random.Generator) -> None:
             (span(rng, -4, 3), 0.0, distance),
             math.pi + float(rng.choice([0, 0.5, 1.57, -1.57]) * (1 + 0.1 * rng.normal())),
         )
-        buildings.stairs(place, span(rng, 1, 4), int(rng.integers(3, 14)), rng)
+        grounds.stairs(place, span(rng, 1, 4), int(rng.integers(3, 14)), rng)
     for _ in range(int(rng.integers(0, 3))):
         place = Site.facing(raster, (span(rng, -5, 5), 0.0, span(rng, 2, distance)), math.pi + span(rng, -0.8, 0.8))
-        buildings.railing(place, span(rng, 2, 6), span(rng, 0.8, 1.2), plain(span(rng, 0, 1)), rng)
+        grounds.railing(place, span(rng, 2, 6), span(rng, 0.8, 1.2), plain(span(rng, 0, 1)), rng)
     _outdoors(raster, rng, trees=int(rng.integers(0, 2)))
 
 
@@ -102,9 +103,9 @@ def _outdoors(raster: Raster, rng: np.random.Generator, trees: int, beside: floa
     for _ in range(int(rng.integers(0, 4))):
         bush(somewhere(3, 12), span(rng, 0.3, 1.4), rng)
     for _ in range(int(rng.integers(0, 4))):
-        buildings.pole(somewhere(2.5, 15), rng)
+        grounds.pole(somewhere(2.5, 15), rng)
     if rng.random() < 0.4:
-        buildings.wires(somewhere(4, 14).moved(0, 0, 0, span(rng, -1, 1)), span(rng, 10, 40), rng)
+        grounds.wires(somewhere(4, 14).moved(0, 0, 0, span(rng, -1, 1)), span(rng, 10, 40), rng)
     for _ in range(int(rng.integers(0, 3))):
         place, long = somewhere(4, 14), span(rng, 3.6, 4.8)
         place.panel((-long / 2, long / 2), (0, long / 2.6), 0.0, car(rng))

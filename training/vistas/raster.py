@@ -53,7 +53,7 @@ class Raster:
         self.tone: Float32 = np.zeros((height, width), np.float32)
         self.nearness: Float32 = np.zeros((height, width), np.float32)
         self._light, self._ambient = camera.turned(light / np.linalg.norm(light)), ambient
-        self._centre = np.array([width / 2, camera.horizon_px])
+        self._centre = np.array([width / 2, camera.horizon_px]) - 0.5  # as rows and columns are counted
 
     def polygon(
         self,

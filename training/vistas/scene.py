@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from training.scenes import HEIGHT_PX, WIDTH_PX
-from training.vistas.buildings import sky
 from training.vistas.exteriors import canyon, fronts, steps, suburb
+from training.vistas.grounds import sky
 from training.vistas.interiors import aisle, corridor, kitchen, living
 from training.vistas.materials import span
 from training.vistas.raster import Camera, Raster
