@@ -9,11 +9,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from tests.domain.lenses import BARREL, PINCUSHION, error_px, radial, rotation
+from unbend_service.domain.decision import spin_grid
 from unbend_service.domain.errors import InvalidGuides
-from unbend_service.domain.fitting import guides_from_map
+from unbend_service.domain.fitting import fit_guides, guides_from_map
 from unbend_service.domain.grid import Grid
 from unbend_service.domain.guides import DEFAULT_ANCHORS, MAX_REACH, TRUSTED_EXTENT, GuideFamily, Guides
 from unbend_service.domain.maps import Float64, target_lattice
+from unbend_service.domain.records import Correct
 
 ANCHORS = np.array(DEFAULT_ANCHORS)
 
@@ -117,6 +119,21 @@ def test_the_whole_radial_range_gives_unfolded_grids(strength: float, degree: in
     with np.errstate(invalid="ignore"):
         outside = ~(np.abs(true(target)) <= 1.1).all(axis=-1)
     assert (np.abs(grid.source).max(axis=-1)[outside] > 1).all()
+
+
+@pytest.mark.parametrize("points", [33, 65])
+@pytest.mark.parametrize("centre", [(0.0, 0.0), (-0.02, 0.03), (0.02, 0.0)])
+@pytest.mark.parametrize("division", [0.31, 0.33, 0.35])
+def test_hard_pincushions_about_any_centre_do_not_fold(
+    division: float, centre: tuple[float, float], points: int
+) -> None:
+    """Where the lens itself folds in the corners of the target, the cells beside the last source point keep their
+    orientation, as those of an estimate's eight guides would otherwise have the whole picture left alone."""
+    source = target_lattice(61, 61).reshape(-1, 2)
+    away = source - centre
+    target = away / (1 + division * (away**2).sum(axis=1, keepdims=True)) + centre
+    guides = fit_guides(source, target, np.linspace(-0.9, 0.9, 8), 5)
+    assert spin_grid(guides, Correct.NONLINEAR, points).is_unfolded
 
 
 def test_strong_rotations_are_spun() -> None:

@@ -24,6 +24,8 @@ DEFAULT_ANCHORS = (-0.9, -0.3, 0.3, 0.9)
 MAX_REACH = 8.0
 #: 1 - R' C' of two curves that cross at a useful angle; 1 at right angles to the axes, 0 where they touch.
 _LEAST_CROSSING = 0.02
+#: Target points without a source go so much further out than the last that has one, or a cell between them may fold.
+_CLEARANCE = 1.25
 _MAX_COEFFICIENT = 16.0
 _MAX_COUNT = 16  # evenly spaced anchors beyond that make the interpolation between them ill-conditioned
 _MAX_DEGREE = 15
@@ -159,13 +161,13 @@ class Guides:
     def _beyond(self, points: Float64) -> Float64:
         """Source points, outside the picture, for (n, 2) target points at which the curves do not meet.
 
-        On the ray from the middle the last point where they meet is found by bisection; from there the ray goes on
-        in the direction and at the pace it had.
+        On the ray from the middle the last point where they meet is found by bisection; from there, and a
+        little further out, the ray goes on in the direction and at the pace it had.
         """
         low, high = np.zeros(len(points)), np.ones(len(points))
         last, met = self._intersect(np.zeros((1, 2)))
         last, met = np.repeat(last, len(points), axis=0), np.repeat(met, len(points))
-        for _ in range(8):
+        for _ in range(16):
             share = (low + high) / 2
             found, met_here = self._intersect(points * share[:, None], 10)
             low, high = np.where(met_here, share, low), np.where(met_here, high, share)
@@ -177,7 +179,7 @@ class Guides:
         before, _ = self._intersect(points * (0.9 * low)[:, None])
         pace = (last - before) / np.maximum(0.1 * low, 1e-9)[:, None]
         pace *= np.minimum(1, 2 / np.maximum(np.hypot(*pace.T), 1e-9))[:, None]  # near a fold it has no bound
-        return np.asarray(last + pace * (1 - low)[:, None])
+        return np.asarray(_CLEARANCE * last + pace * (1 - low)[:, None])
 
     def to_dict(self) -> dict[str, Any]:
         """The ``guides`` object of the API: {rows, columns: [{anchor, coefficients}]}."""
