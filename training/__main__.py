@@ -208,9 +208,12 @@ def _export(arguments: argparse.Namespace) -> None:
     if arguments.calibration is not None:
         confidence = tuple(json.loads(arguments.calibration.read_text())["weights"])
     checkpoint = Checkpoint.load(arguments.directory / f"{arguments.name}.pt")
-    difference = export(checkpoint, arguments.weights, confidence=confidence, min_confidence=arguments.min_confidence)
-    _export_branch(arguments, arguments.weights)
-    print(f"{arguments.weights}: {checkpoint.samples} samples, differs from torch by {difference:.1e}")
+    weights: Path = arguments.weights
+    difference = export(
+        checkpoint, weights, weights.stem, confidence=confidence, min_confidence=arguments.min_confidence
+    )
+    _export_branch(arguments, weights)
+    print(f"{weights}: {checkpoint.samples} samples, differs from torch by {difference:.1e}")
 
 
 def _export_branch(arguments: argparse.Namespace, weights: Path) -> None:

@@ -100,6 +100,17 @@ def test_a_straight_facade_is_left_as_it_is(estimator: Estimator) -> None:
     assert np.linalg.norm(moved, axis=-1).mean() * 128 < 0.5
 
 
+def test_the_weights_of_clear_provenance_straighten_too() -> None:
+    """`lineset-free` is the same estimator under its own name and threshold."""
+    free = load_estimator("lineset-free", threads=1)
+    picture, source = bent(480, 360, -0.18)
+    error, nothing = bend_error(free, picture, source)
+    assert error < 0.25 * nothing
+    estimate = free.estimate(picture)
+    assert estimate.model.name == "lineset-free"
+    assert estimate.confidence >= free.model.min_confidence
+
+
 @pytest.mark.parametrize("shape", [(256, 256), (1, 1), (3, 2000)])
 def test_a_picture_without_edges_is_left_alone(estimator: Estimator, shape: tuple[int, int]) -> None:
     """No edges, no evidence: straight guides, confidence 0, and the decision says so."""
