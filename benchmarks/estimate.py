@@ -16,7 +16,7 @@ from unittest.mock import patch
 from onnxruntime import InferenceSession
 
 import unbend
-from benchmarks.material import jpeg, photograph
+from benchmarks.material import bent, jpeg, photograph
 from benchmarks.measurement import Report, Timing, by_turns
 from benchmarks.serving import Served, served
 from unbend_service.adapters.codecs.pillow import PillowCodec
@@ -72,6 +72,10 @@ def run(arguments: argparse.Namespace) -> Report:
             report.add_ratio("gRPC round trip, s", pair.ours.median_s, at_most=BAR_S)
             report.rows.append({"name": "the network's share of gRPC", "share": 1 - 1 / pair.ratio})
             print(f"the network's share: HTTP {share:.0%}, gRPC {1 - 1 / pair.ratio:.0%}", flush=True)
+            body = jpeg(bent(photograph(1920, 1080)))
+            pair = by_turns(lambda: _post(connection, fresh()), local, runs)
+            report.add_pair("HTTP /v1/estimate, 1080p JPEG bent by a lens", pair, peer_name="in process")
+            body = jpeg(photograph(1920, 1080))
             connection.close()
             _parts(report, body, runs, settings)
         finally:

@@ -49,6 +49,15 @@ def photograph(width: int, height: int, seed: int = 1) -> Bytes:
     return np.asarray(np.clip(picture + grain, 0, 255), dtype=np.uint8)
 
 
+def bent(picture: Bytes, strength: float = 0.2) -> Bytes:
+    """(height, width, 3) uint8: the middle of a picture through a barrel lens, division model, half the width is 1."""
+    height, width = picture.shape[:2]
+    x, y = ((2 * np.arange(n, dtype=np.float32) + 1 - n) / width for n in (width, height))
+    zoom = (1 - 0.6 * strength) / (1 - strength * (x[None] ** 2 + y[:, None] ** 2))
+    map_x, map_y = (width * x[None] * zoom + width - 1) / 2, (width * y[:, None] * zoom + height - 1) / 2
+    return np.asarray(cv2.remap(picture, map_x, map_y, cv2.INTER_LINEAR), dtype=np.uint8)
+
+
 def jpeg(picture: Bytes, quality: int = 92) -> bytes:
     """A JPEG file of (height, width, 3) uint8 RGB, 4:2:0."""
     _, body = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
