@@ -124,7 +124,7 @@ class LinesetEstimator:
         return self._model
 
     def estimate(self, grey: Bytes) -> Estimate:
-        """Estimates the guides of one picture; thread-safe, blocking, about 30 ms on two cores.
+        """Estimates the guides of one picture; thread-safe, blocking, about 25 ms on two cores.
 
         Args:
             grey: (height, width) uint8, any size, upright.
