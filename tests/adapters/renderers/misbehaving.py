@@ -17,6 +17,7 @@ from unbend_service.domain.frames import Border, Frame
 from unbend_service.domain.grid import Grid
 
 DRAW, SLEEP, CRASH, KILLED_TWICE, KILLED, HANG, RAISE, WHO, STOPPED_ONCE, LOST, LOST_ONCE, THREADS = range(12)
+STOPPED_TWICE = 12
 SLEEP_S = 0.5
 
 
@@ -41,7 +42,7 @@ class MisbehavingRenderer:
             os.kill(os.getpid(), signal.SIGKILL)
         elif order == HANG:
             time.sleep(3600)
-        elif order == STOPPED_ONCE and times_before() < 1:
+        elif (order == STOPPED_ONCE and times_before() < 1) or (order == STOPPED_TWICE and times_before() < 2):
             os.kill(os.getpid(), signal.SIGSTOP)
         elif order == LOST or (order == LOST_ONCE and times_before() < 1):
             raise RendererUnavailable("The OpenGL context is lost.")

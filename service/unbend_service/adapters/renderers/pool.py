@@ -38,9 +38,9 @@ log = structlog.get_logger(__name__)
 DEFAULT_FACTORY = "unbend_service.adapters.renderers.selection:open_renderer"
 #: A GPU gains little from more processes than keep it fed, and each holds a context and textures of its own.
 _WORKERS_OF_A_GPU = 4
-#: Two crashes or hangs make a frame poison. A SIGKILL comes from outside and says less of the frame, unless it comes
-#: every time.
-_BLAME_OF_A_CRASH, _BLAME_OF_A_KILL, _BLAME_OF_POISON = 2, 1, 4
+#: Two crashes make a frame poison. Who hangs may have been stopped from outside, and a SIGKILL comes from there; these
+#: say less of the frame, unless they come every time.
+_BLAME_OF_A_CRASH, _BLAME_OF_A_HANG, _BLAME_OF_A_KILL, _BLAME_OF_POISON = 6, 4, 3, 12
 #: A frame that is alone may use so many cores, if it is worth their waking.
 _MOST_THREADS, _WORTH_THREADS_BYTES = 8, 1 << 20
 _METER_INTERVAL_S = 0.1
@@ -269,12 +269,13 @@ class WorkerPool:
             _settle(job, answer.error)
             self._finish(job)
 
-    def on_death(self, worker: WorkerProcess, killed: bool) -> None:
+    def on_death(self, worker: WorkerProcess, killed: bool, hung: bool) -> None:
         """A worker is gone: the frame it rendered is blamed, and all it held wait again, first in the queue."""
         culprit = worker.sent[0] if worker.sent else None
+        blame = _BLAME_OF_A_KILL if killed else _BLAME_OF_A_HANG if hung else _BLAME_OF_A_CRASH
         for job in sorted(worker.held, key=lambda job: job.number, reverse=True):
             if job is culprit:
-                job.blame += _BLAME_OF_A_KILL if killed else _BLAME_OF_A_CRASH
+                job.blame += blame
             if job.blame >= _BLAME_OF_POISON:
                 self._quarantine.add(job.frame, job.grid, job.border)
                 _settle(job, PoisonFrame("Worker after worker died while it rendered this frame."))

@@ -31,6 +31,8 @@ _DEPUTY_STAYS_S = 30.0
 _FAILURES_TO_GIVE_UP = 3
 _LONGEST_BACKOFF_S = 30.0
 _LAST_WORDS_S = 2.0
+#: Why a worker was killed that rendered one frame for too long.
+HUNG = "hung"
 #: The channel of a dying process closes a moment before its exit status is there.
 _LAST_BREATH_S = 0.05
 
@@ -40,8 +42,9 @@ class Listener(Protocol):
 
     def on_answer(self, worker: WorkerProcess, answer: Done | Failed) -> None: ...
 
-    def on_death(self, worker: WorkerProcess, killed: bool) -> None:
-        """``killed``: from outside or for lack of memory, not by a fault of its own."""
+    def on_death(self, worker: WorkerProcess, killed: bool, hung: bool) -> None:
+        """``killed``: from outside or for lack of memory, not by a fault of its own. ``hung``: killed here, as it
+        rendered one frame for longer than ``hang_s``."""
         ...
 
     def on_restart(self, reason: str) -> None: ...
@@ -255,7 +258,7 @@ class Supervisor:
             self._first.set_exception(refusal.error)
 
     def _watch_frame(self, place: Place) -> None:
-        self._watch(place, self._hang_s, "hung")
+        self._watch(place, self._hang_s, HUNG)
         loop = asyncio.get_running_loop()
         place.suspicion = loop.call_later(_SUSPECT * self._hang_s, self._suspect, place)
 
@@ -293,7 +296,7 @@ class Supervisor:
             exit_status=status,
             frames=len(worker.held),
         )
-        self._listener.on_death(worker, killed)
+        self._listener.on_death(worker, killed, hung=reason == HUNG)
         self._retry(place, reason)
 
     def _retry(self, place: Place, reason: str) -> None:
