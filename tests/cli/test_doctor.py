@@ -151,6 +151,14 @@ def test_a_missing_extra_is_named_with_what_it_is_for_and_how_to_get_it() -> Non
     assert remedy == "pip install 'unbend[video]'"
 
 
+def test_an_extra_whose_namespace_another_package_fills_is_missing_all_the_same() -> None:
+    found = extras_without(
+        "opentelemetry.sdk", "ModuleNotFoundError(\"No module named 'opentelemetry.sdk'\", name='opentelemetry.sdk')"
+    )
+
+    assert found["extra otel"][1] == "not installed; needed for traces"
+
+
 def test_an_extra_that_is_there_and_does_not_load_is_not_called_installed() -> None:
     found = extras_without("OpenEXR", "ImportError('libImath.so: cannot open shared object file')")
 

@@ -81,7 +81,7 @@ def examine_extras() -> Iterator[Finding]:
         try:
             importlib.import_module(extra.module)
         except ModuleNotFoundError as error:
-            if (error.name or "").partition(".")[0] == extra.module:
+            if f"{extra.module}.".startswith(f"{error.name}."):  # it, or a package around it
                 yield Finding(f"extra {name}", "note", f"not installed; needed for {extra.purpose}", remedy)
             else:
                 yield Finding(f"extra {name}", "note", f"{extra.module} lacks {error.name}", remedy)
