@@ -118,17 +118,19 @@ scale-demo: setup-dev  ## Two replicas, Redis and HAProxy: one killed, both rest
 
 TRAINING = OMP_NUM_THREADS=1 $(BIN)/python -m training --photos $(PHOTOS)
 
+TRAINED = $(HOME)/.cache/unbend/training
+
 train: $(VENV)/.training  ## Go on with the long training run (training/README.md); stop it with Ctrl-C
-	test -f $(HOME)/.cache/unbend/training/chains.npz || $(TRAINING) store
-	$(TRAINING) train
+	test -f $(TRAINED)/chains.npz -a -f $(TRAINED)/pictures.npz || $(TRAINING) pack
+	$(TRAINING) together
 
 train-smoke: $(VENV)/.training  ## A minute of training, resuming and exporting, on drawn pictures
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/training
 
-export: $(VENV)/.training  ## Cool the run down for half an hour, calibrate it, and write ONNX and card
-	$(TRAINING) cooldown --minutes 30
-	$(TRAINING) calibrate
-	$(TRAINING) export --calibration $(HOME)/.cache/unbend/training/run-cooled-calibration.json
+export: $(VENV)/.training  ## Bring the run to rest in half an hour, calibrate it, and write ONNX and card
+	$(TRAINING) together --minutes 30 --rates 0.4 0.01
+	$(TRAINING) calibrate --name together --branch together-branch
+	$(TRAINING) export --name together --branch together-branch --calibration $(TRAINED)/together-calibration.json
 
 evaluate: setup  ## Measure the models over the validation photographs of PHOTOS, beside peers: evaluation/report.md
 	$(BIN)/unbend eval --photos $(PHOTOS) --model lineset --model first --peers

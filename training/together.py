@@ -10,6 +10,7 @@ to know of the chains may shape the line-set network's state, but not its answer
 from __future__ import annotations
 
 import json
+import signal
 import time
 from collections import defaultdict, deque
 from dataclasses import dataclass, replace
@@ -68,7 +69,7 @@ class TogetherRun:
         self.generator = torch.Generator(device).manual_seed(seed + self.step)
 
     def checkpoints(self) -> tuple[Checkpoint, BranchCheckpoint]:
-        """The run at this moment; the optimisers' state is left out when it is to ship."""
+        """The run at this moment."""
         lineset = replace(
             self._lineset,
             model=_on_processor(self.network), average=_on_processor(self.average),
@@ -155,10 +156,13 @@ def train_together(
     directory: Path,
     *,
     name: str,
-    minutes: float,
+    minutes: float | None,
     rates: tuple[float, float],
 ) -> None:
-    """Learns for so many minutes, the rate going from rates[0] to rates[1] of the recipe's; saves at the end."""
+    """Learns for so many minutes, the rate going from rates[0] to rates[1] of the recipe's, or without end at rates[0];
+    saves now and then, at the end, and when it is asked to stop (SIGTERM, SIGINT)."""
+    asked: list[int] = []
+    previous = {s: signal.signal(s, lambda number, _: asked.append(number)) for s in (signal.SIGTERM, signal.SIGINT)}
     began = reported = saved = time.monotonic()
     before, reported_samples, step = run.seconds, run.samples, 0
     sums: dict[str, list[Tensor]] = defaultdict(list)
@@ -167,8 +171,8 @@ def train_together(
     order = np.random.default_rng(run.step)
     for drawn in drawing:
         now = time.monotonic()
-        done = (now - began) / 60 / minutes
-        if done >= 1:
+        done = (now - began) / 60 / minutes if minutes else 0.0
+        if done >= 1 or asked:
             break
         told = drawn.to(run.device)
         views = None if drawn.again else seen(told, atlas, run.generator)
@@ -205,6 +209,8 @@ def train_together(
             run.save(directory, name)
             saved = now
     run.save(directory, name)
+    for number, handler in previous.items():
+        signal.signal(number, handler)
 
 
 def seen(told: dict[str, Tensor], atlas: Atlas | None, generator: torch.Generator) -> Tensor:

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    import torch
-
+    from training.checkpoints import Checkpoint
     from training.drawing import Drawn
+    from training.picture_loop import BranchCheckpoint
     from training.picture_pack import PicturePack
-    from training.together import TogetherRun
+    from training.sampler import Sampler
 
 TRAINING, HELD_OUT = "", "-held-out"
 _HELD_OUT_BATCHES = {"imitated": 512, "extracted": 192}
@@ -30,15 +30,16 @@ def add_together_verbs(verbs: Any) -> None:
     together = verbs.add_parser("together", help="train both networks at once, or go on with it")
     together.add_argument("--name", default="together")
     together.add_argument("--source", action="append", help="photographs to learn from; all if none is named")
-    together.add_argument("--minutes", type=float, required=True)
+    together.add_argument("--minutes", type=float, help="without end unless given; stop it whenever you like (SIGTERM)")
     together.add_argument("--rates", type=float, nargs=2, default=(1.0, 1.0), help="first and last share of the rate")
-    together.add_argument("--imitated", type=int, default=6, help="processes that warp chains")
+    cores = os.cpu_count() or 1
+    together.add_argument("--imitated", type=int, default=max(1, cores - 1), help="processes that warp chains")
     together.add_argument("--extracted", type=int, default=0, help="processes that warp pictures and search them")
     together.add_argument("--batch-size", type=int, default=256)
     together.add_argument("--extracted-batch-size", type=int, default=128)
     together.add_argument("--drawn-share", type=float, default=0.22)
     together.add_argument("--chain-width", type=int, default=192)
-    together.add_argument("--device", default="cuda")
+    together.add_argument("--device", help="cuda, or cpu; unless given, a GPU if there is one")
     together.add_argument("--seed", type=int, default=0)
     together.set_defaults(verb=_together)
 
@@ -72,7 +73,7 @@ def _together(arguments: argparse.Namespace) -> None:
     from training.picture_pack import PicturePack
     from training.picture_sampler import PictureSampler
     from training.sampler import Sampler
-    from training.together import train_together
+    from training.together import TogetherRecipe, TogetherRun, train_together
 
     directory: Path = arguments.directory
     sources = None if arguments.source is None else tuple(arguments.source)
@@ -83,17 +84,15 @@ def _together(arguments: argparse.Namespace) -> None:
     if arguments.extracted:
         chosen = pack.only(sources, arguments.drawn_share)
         draws += [extracted(PictureSampler(chosen), arguments.extracted_batch_size)] * arguments.extracted
-    begun = (directory / f"{arguments.name}-branch.pt").exists()
-    checkpoint = None if begun else _begun(sampler, arguments)
+    lineset, branch = _checkpoints(sampler, arguments)
     held_out_pack = PicturePack.load(directory / "pictures-held-out.npz")
     held_out = _held_out(directory, held_out_pack, len(pack.pictures))
     # The processes that draw are forked before anything touches the GPU.
-    run_step = 0 if checkpoint is not None else _step(directory, arguments.name)
-    drawing = Drawing(draws, arguments.seed * 1_000_003 + run_step)
-    device = torch.device(arguments.device)
+    drawing = Drawing(draws, arguments.seed * 1_000_003 + branch.step)
+    device = torch.device(arguments.device or ("cuda" if torch.cuda.is_available() else "cpu"))
     if device.type == "cuda":
         torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = True
-    run = _run(checkpoint, directory, arguments, device)
+    run = TogetherRun(lineset, branch, TogetherRecipe(), device, arguments.seed)
     atlas = Atlas([*pack.pictures, *held_out_pack.pictures], device)
     train_together(
         run, drawing, atlas, held_out, directory,
@@ -102,37 +101,23 @@ def _together(arguments: argparse.Namespace) -> None:
     drawing.stop()
 
 
-def _begun(sampler: Any, arguments: argparse.Namespace) -> Any:
+def _checkpoints(sampler: Sampler, arguments: argparse.Namespace) -> tuple[Checkpoint, BranchCheckpoint]:
+    """Of the run so far, or of one that begins with nothing."""
     from dataclasses import replace
 
-    from training.loop import default_shape, new_checkpoint
-
-    shape = replace(default_shape(), chain_width=arguments.chain_width)
-    return new_checkpoint(sampler, shape, arguments.seed)
-
-
-def _step(directory: Path, name: str) -> int:
-    from training.picture_loop import BranchCheckpoint
-
-    return BranchCheckpoint.load(directory / f"{name}-branch.pt").step
-
-
-def _run(checkpoint: Any, directory: Path, arguments: argparse.Namespace, device: torch.device) -> TogetherRun:
     from training.checkpoints import Checkpoint
+    from training.loop import default_shape, new_checkpoint
     from training.picture_loop import BranchCheckpoint, new_branch_checkpoint
     from training.picture_network import BranchShape
-    from training.together import TogetherRecipe, TogetherRun
 
-    name = arguments.name
-    if checkpoint is None:
-        checkpoint = Checkpoint.load(directory / f"{name}.pt")
-        branch = BranchCheckpoint.load(directory / f"{name}-branch.pt")
-    else:
-        notes = {"seed": arguments.seed, "lineset": name, "sources": arguments.source}
-        checkpoint.notes.update(sources=arguments.source)
-        shape = BranchShape(state=checkpoint.shape.global_width, widths=(32, 64, 128), hidden=320, depth=3)
-        branch = new_branch_checkpoint(checkpoint.averaged_network(), None, notes, shape)
-    return TogetherRun(checkpoint, branch, TogetherRecipe(), device, arguments.seed)
+    paths = [arguments.directory / f"{arguments.name}{suffix}.pt" for suffix in ("", "-branch")]
+    if paths[1].exists():
+        return Checkpoint.load(paths[0]), BranchCheckpoint.load(paths[1])
+    lineset = new_checkpoint(sampler, replace(default_shape(), chain_width=arguments.chain_width), arguments.seed)
+    lineset.notes.update(sources=arguments.source)
+    shape = BranchShape(state=lineset.shape.global_width, widths=(32, 64, 128), hidden=320, depth=3)
+    notes = {"seed": arguments.seed, "lineset": arguments.name, "sources": arguments.source}
+    return lineset, new_branch_checkpoint(lineset.averaged_network(), None, notes, shape)
 
 
 def _held_out(directory: Path, pack: PicturePack, first: int) -> list[Drawn]:
