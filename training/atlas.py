@@ -44,6 +44,7 @@ class Atlas:
         size = len(extent)
         lattice = specs["target"].permute(0, 3, 1, 2)
         at = (self._at / LATTICE_REACH).expand(size, -1, -1, -1)
+        # In the target frame; then without the natural tilt; then in the frame of the picture: all isotropic.
         x, y = grid_sample(lattice, at, mode="bicubic", padding_mode="border", align_corners=True).unbind(1)
         entry = specs["to_window"][:, :, :, None, None]
         depth = (entry[:, 2, 0] * x + entry[:, 2, 1] * y + entry[:, 2, 2]).clamp(min=0.2)
