@@ -20,6 +20,7 @@ from unbend_service.application.ports import (
     SharedPicture,
     WorkerState,
 )
+from unbend_service.domain.decision import Caution
 from unbend_service.domain.errors import Draining, UnbendError
 from unbend_service.domain.frames import Border, Frame, split_planes
 from unbend_service.domain.grid import Grid
@@ -27,7 +28,7 @@ from unbend_service.domain.guides import GuideFamily, Guides
 from unbend_service.domain.maps import pixel_centres
 from unbend_service.domain.records import GridRecord
 
-FAKE_MODEL = ModelInfo(name="fake", sha256="0" * 64)
+FAKE_MODEL = ModelInfo(name="fake", sha256="0" * 64, caution=Caution(0.3, 0.6, 0.5 * 2 / 256))
 
 
 def barrel_guides(bend: float = 0.06) -> Guides:

@@ -91,7 +91,9 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--name", default="run-cooled")
     export.add_argument("--weights", type=Path, default=Path("service/unbend_service/models/lineset.onnx"))
     export.add_argument("--calibration", type=Path, help="the .json that `calibrate` wrote")
-    export.add_argument("--min-confidence", type=float, default=0.8, help="threshold that the card advises")
+    export.add_argument("--min-confidence", type=float, default=0.8, help="below it nothing is to be corrected")
+    export.add_argument("--full-confidence", type=float, help="from it on all of it (default: the same)")
+    export.add_argument("--doubtful-px", type=float, default=0.0, help="between them this much; px at 256")
     export.set_defaults(verb=_export)
 
     calibrate = verbs.add_parser("calibrate", help="fit the confidence of a checkpoint on training photographs")
@@ -108,7 +110,7 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--weights", type=Path, help="an exported .onnx; otherwise --name's checkpoint is exported")
     evaluate.add_argument("--name", default="run")
     evaluate.add_argument("--limit", type=int, default=48, help="photographs per family")
-    evaluate.add_argument("--threshold", type=float, default=0.5, help="confidence below which nothing is corrected")
+    evaluate.add_argument("--threshold", type=float, help="of confidence, in place of the card's advice")
     evaluate.set_defaults(verb=_evaluate)
     add_vgg_verbs(verbs)
     return parser
@@ -203,15 +205,17 @@ def _plot(arguments: argparse.Namespace) -> None:
 def _export(arguments: argparse.Namespace) -> None:
     from training.checkpoints import Checkpoint
     from training.export import UNCALIBRATED, export
+    from unbend_service.domain.decision import Caution
 
+    least, doubtful_px = arguments.min_confidence, arguments.doubtful_px
+    full = least if arguments.full_confidence is None else arguments.full_confidence
     confidence = UNCALIBRATED
     if arguments.calibration is not None:
         confidence = tuple(json.loads(arguments.calibration.read_text())["weights"])
     checkpoint = Checkpoint.load(arguments.directory / f"{arguments.name}.pt")
     weights: Path = arguments.weights
-    difference = export(
-        checkpoint, weights, weights.stem, confidence=confidence, min_confidence=arguments.min_confidence
-    )
+    caution = Caution(least, full, doubtful_px * 2 / 256)
+    difference = export(checkpoint, weights, weights.stem, confidence=confidence, caution=caution)
     _export_branch(arguments, weights)
     print(f"{weights}: {checkpoint.samples} samples, differs from torch by {difference:.1e}")
 
@@ -247,10 +251,11 @@ def _calibrate(arguments: argparse.Namespace) -> None:
 
 def _evaluate(arguments: argparse.Namespace) -> None:
     from training.checkpoints import Checkpoint
-    from training.evaluation import measure, measure_harm, table, write
+    from training.evaluation import measure, measure_whole, table, write
     from training.export import export
     from training.protocol import photographs
     from unbend_service.adapters.estimators.catalogue import load_estimator
+    from unbend_service.domain.decision import Caution
 
     directory: Path = arguments.directory / "evaluations"
     weights: Path | None = arguments.weights
@@ -262,7 +267,10 @@ def _evaluate(arguments: argparse.Namespace) -> None:
         export(checkpoint, weights)
     estimator = load_estimator(str(weights), arguments.threads)
     pictures = photographs(arguments.photos, "val", arguments.limit)
-    text = table(measure(estimator, pictures), measure_harm(estimator, pictures), arguments.threshold, title)
+    threshold = arguments.threshold
+    caution = None if threshold is None else Caution(threshold, threshold)
+    measured = measure(estimator, pictures, caution=caution) + measure_whole(estimator, pictures, caution)
+    text = table(measured, title)
     write(text, directory / f"{weights.stem}-{arguments.limit}.md")
     print(text)
 

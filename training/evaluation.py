@@ -19,11 +19,13 @@ from training.distortions import DistortionBatch
 from training.protocol import FAMILIES, LZSL_SIX, Bytes, cases
 from unbend_service.adapters.estimators.lineset import Evidence, LinesetEstimator
 from unbend_service.application.ports import Estimator
-from unbend_service.domain.decision import spin_grid
-from unbend_service.domain.errors import InvalidGrid, InvalidGuides
+from unbend_service.domain.decision import TRUSTING, Caution, decide
+from unbend_service.domain.errors import InvalidGuides
+from unbend_service.domain.grid import Grid
 from unbend_service.domain.guides import Guides
 from unbend_service.domain.maps import BackwardMap, target_lattice
 from unbend_service.domain.records import Correct
+from unbend_service.evaluation.measures import as_rendered
 
 Float64 = npt.NDArray[np.float64]
 
@@ -36,21 +38,28 @@ WHOLE = "whole"
 
 @dataclass(frozen=True)
 class Measurement:
-    """One picture: errors in px at 256, of doing nothing and of the estimate."""
+    """One picture: errors in px at 256, of doing nothing, of the estimate, and of what the service would make of it."""
 
     family: str
     overall_nothing: float
     overall: float
     nonlinear_nothing: float
     nonlinear: float
+    applied: float
+    strength: float
     evidence: Evidence | None
     confidence: float
 
 
 def measure(
-    estimator: Estimator, photographs: list[Bytes], families: Iterable[str] = FAMILIES, seed: int | None = None
+    estimator: Estimator,
+    photographs: list[Bytes],
+    families: Iterable[str] = FAMILIES,
+    seed: int | None = None,
+    caution: Caution | None = None,
 ) -> list[Measurement]:
-    """Every photograph under every family; see `protocol.cases` for the seed."""
+    """Every photograph under every family; see `protocol.cases` for the seed. Without a caution, that of the card."""
+    caution = caution or estimator.model.caution
     measurements = []
     for family in families:
         for case in cases(family, photographs, seed):
@@ -61,10 +70,28 @@ def measure(
                 overall, nonlinear = map_errors(guides, target, truth)
             except InvalidGuides:  # the service leaves such a picture alone
                 overall, nonlinear, confidence = overall_nothing, nonlinear_nothing, 0.0
+            grid, strength = _applied(guides, confidence, caution)
+            applied = map_errors(as_rendered(grid), target, truth)[1] if strength else nonlinear_nothing
             measurements.append(
-                Measurement(family, overall_nothing, overall, nonlinear_nothing, nonlinear, evidence, confidence)
+                Measurement(
+                    family=family,
+                    overall_nothing=overall_nothing,
+                    overall=overall,
+                    nonlinear_nothing=nonlinear_nothing,
+                    nonlinear=nonlinear,
+                    applied=applied,
+                    strength=strength,
+                    evidence=evidence,
+                    confidence=confidence,
+                )
             )
     return measurements
+
+
+def _applied(guides: Guides, confidence: float, caution: Caution) -> tuple[Grid, float]:
+    """What the service would make of it, and how much of the estimate that is."""
+    record = decide(guides, confidence, "", "", correct=Correct.NONLINEAR, caution=caution, points=_LATTICE)
+    return record.grid, record.strength
 
 
 def _look(estimator: Estimator, picture: Bytes) -> tuple[Guides, Evidence | None, float]:
@@ -131,68 +158,72 @@ def _residual(backward: BackwardMap, target: Float64, truth: Float64, p: Float64
     return here - truth, jacobian.reshape(-1, 8)
 
 
-def measure_whole(estimator: Estimator, photographs: list[Bytes]) -> list[Measurement]:
-    """Undistorted whole photographs, 512 px on the long side: `nonlinear` is by how much the nonlinear correction would
-    move them on average, px at 256 on the long side."""
+def measure_whole(estimator: Estimator, photographs: list[Bytes], caution: Caution | None = None) -> list[Measurement]:
+    """Undistorted whole photographs, 512 px on the long side: `nonlinear` and `applied` are by how much the nonlinear
+    correction would move them on average, px at 256 on the long side."""
+    caution = caution or estimator.model.caution
     measurements = []
     for photograph in photographs:
         scale = _FULL_LONG_SIDE_PX / max(photograph.shape[:2])
         small = cv2.resize(photograph, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         grey = np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.uint8)
         guides, evidence, confidence = _look(estimator, grey)
-        moved = _displacement(guides, small.shape[1], small.shape[0])
-        measurements.append(Measurement(WHOLE, 0.0, moved, 0.0, moved, evidence, confidence))
+        moved = _displacement(_applied(guides, 1.0, TRUSTING)[0], grey)
+        grid, strength = _applied(guides, confidence, caution)
+        measurements.append(
+            Measurement(
+                family=WHOLE,
+                overall_nothing=0.0,
+                overall=moved,
+                nonlinear_nothing=0.0,
+                nonlinear=moved,
+                applied=_displacement(grid, grey),
+                strength=strength,
+                evidence=evidence,
+                confidence=confidence,
+            )
+        )
     return measurements
 
 
-def measure_harm(estimator: Estimator, photographs: list[Bytes]) -> Float64:
-    """(n, 2): displacement of undistorted whole photographs, see `measure_whole`, and the confidence."""
-    return np.array([(m.nonlinear, m.confidence) for m in measure_whole(estimator, photographs)])
-
-
-def _displacement(guides: Guides, width: int, height: int) -> float:
-    if guides.is_straight:
-        return 0.0
-    try:
-        grid = spin_grid(guides, Correct.NONLINEAR, 33)
-    except (InvalidGuides, InvalidGrid):
-        return 0.0
-    offset = (grid.source - target_lattice(33, 33)) * np.array([width, height]) / max(width, height)
+def _displacement(grid: Grid, grey: Bytes) -> float:
+    """Mean, px at 256 on the long side."""
+    offset = (grid.source - target_lattice(grid.rows, grid.columns)) * np.array(grey.shape[::-1]) / max(grey.shape)
     return float(np.hypot(offset[..., 0], offset[..., 1]).mean() * PIXELS)
 
 
-def table(measurements: list[Measurement], harm: Float64, threshold: float, title: str) -> str:
-    """Markdown: errors by family with the do-nothing line, as estimated and as applied above the threshold."""
+def table(measurements: list[Measurement], title: str) -> str:
+    """Markdown: errors by family with the do-nothing line, as estimated and as the service applies it."""
     lines = [
         f"### {title}",
         "",
         "| family | n | all: nothing | all | median | up to a homography: nothing | raw | median |"
-        f" applied (confidence >= {threshold:g}) | made worse | corrected |",
+        " applied | made worse | corrected |",
         "|" + "---|" * 11,
     ]
-    for family in dict.fromkeys(m.family for m in measurements):
-        own = [m for m in measurements if m.family == family]
-        nothing_all, overall, nothing, raw = (
+    distorted = [m for m in measurements if m.family != WHOLE]
+    for family in dict.fromkeys(m.family for m in distorted):
+        own = [m for m in distorted if m.family == family]
+        nothing_all, overall, nothing, raw, applied, strength = (
             np.array([getattr(m, name) for m in own])
-            for name in ("overall_nothing", "overall", "nonlinear_nothing", "nonlinear")
+            for name in ("overall_nothing", "overall", "nonlinear_nothing", "nonlinear", "applied", "strength")
         )
-        used = np.array([m.confidence >= threshold for m in own])
-        applied = np.where(used, raw, nothing)
         lines.append(
             f"| {family} | {len(own)} | {nothing_all.mean():.2f} | {overall.mean():.2f} |"
             f" {np.median(overall):.2f} | {nothing.mean():.2f} | {raw.mean():.2f} | {np.median(raw):.2f} |"
-            f" {applied.mean():.2f} | {(applied > nothing + 0.25).mean():.2f} | {used.mean():.2f} |"
+            f" {applied.mean():.2f} | {(applied > nothing + 0.25).mean():.2f} | {(strength > 0).mean():.2f} |"
         )
-    six = [[(m.overall_nothing, m.overall) for m in measurements if m.family == family] for family in LZSL_SIX]
+    six = [[(m.overall_nothing, m.overall) for m in distorted if m.family == family] for family in LZSL_SIX]
     if all(six):
         nothing_mean, mean = np.mean([np.mean(pairs, 0) for pairs in six], 0)
         lines += ["", f"All, mean of six: {nothing_mean:.2f} (nothing) -> **{mean:.2f}**."]
-    if len(harm):
-        moved = np.where(harm[:, 1] >= threshold, harm[:, 0], 0.0)
+    whole = [m for m in measurements if m.family == WHOLE]
+    if whole:
+        raw, moved = (np.array([getattr(m, name) for m in whole]) for name in ("nonlinear", "applied"))
         lines += [
             "",
-            f"Undistorted photographs (n={len(harm)}), nonlinear displacement px: raw mean {harm[:, 0].mean():.3f},"
-            f" p95 {np.percentile(harm[:, 0], 95):.2f}, below 0.5 px {(harm[:, 0] < 0.5).mean():.3f};"
+            f"Undistorted photographs (n={len(whole)}), nonlinear displacement px: raw mean {raw.mean():.3f},"
+            f" p95 {np.percentile(raw, 95):.2f}, below 0.5 px {(raw < 0.5).mean():.3f};"
             f" applied mean {moved.mean():.3f}, p95 {np.percentile(moved, 95):.2f}, below 0.5 px"
             f" {(moved < 0.5).mean():.3f}.",
         ]

@@ -16,6 +16,7 @@ from training.checkpoints import Checkpoint
 from training.labels import ANCHORS, NODES
 from training.lineset_network import LinesetNetwork
 from unbend_service.adapters.estimators.chain_features import FEATURES
+from unbend_service.domain.decision import TRUSTING, Caution
 
 SEARCHED_LONG_SIDE_PX = 384
 LOOKS = 2
@@ -31,7 +32,7 @@ def export(
     name: str = "lineset",
     confidence: tuple[float, ...] = UNCALIBRATED,
     looks: int = LOOKS,
-    min_confidence: float = 0.0,
+    caution: Caution = TRUSTING,
 ) -> float:
     """Writes `weights` (.onnx) and the .json card beside it; returns the largest difference from torch.
 
@@ -63,7 +64,7 @@ def export(
     difference = parity(network, weights)
     if difference > PARITY_TOLERANCE:
         raise RuntimeError(f"ONNX Runtime differs from torch by {difference:.2e}.")
-    write_card(weights, name, confidence, looks, min_confidence)
+    write_card(weights, name, confidence, looks, caution)
     return difference
 
 
@@ -80,13 +81,15 @@ def parity(network: LinesetNetwork, weights: Path) -> float:
     return worst
 
 
-def write_card(weights: Path, name: str, confidence: tuple[float, ...], looks: int, min_confidence: float) -> None:
+def write_card(weights: Path, name: str, confidence: tuple[float, ...], looks: int, caution: Caution) -> None:
     """The .json beside the weights, as `unbend_service.adapters.estimators.cards` reads it."""
     card: dict[str, Any] = {
         "name": name,
         "kind": "lineset",
         "sha256": hashlib.sha256(weights.read_bytes()).hexdigest(),
-        "min_confidence": min_confidence,
+        "min_confidence": caution.min_confidence,
+        "full_confidence": caution.full_confidence,
+        "doubtful_px": caution.doubtful_displacement * 256 / 2,
         "parameters": {
             "nodes": NODES.tolist(),
             "anchors": ANCHORS.tolist(),

@@ -121,7 +121,8 @@ class Client:
             answer_format: ``jpeg``, ``png`` or ``webp`` if a file is to come back as another kind of file.
             grid: used instead of an estimate: an id, a record, an estimate or an earlier correction, a lattice or
                 guides.
-            min_confidence: 0..1; below it the picture is left alone. The server's setting if left out.
+            min_confidence: 0..1; below it the picture is left alone, from it on corrected all the way. If left out the
+                server's setting, or what its model advises: in doubt, a little.
             camera: whose picture it is, a name of your own: what pictures of one camera say of its lens adds up.
                 ``exif`` takes it from the file.
 

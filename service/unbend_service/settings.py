@@ -114,8 +114,8 @@ class Settings(BaseSettings):
         None,
         ge=0,
         le=1,
-        description="Below this confidence a picture is left alone, unless the request says otherwise; "
-        "unset: what the model's card advises, for its lens.",
+        description="Below this confidence a picture is left alone, from it on corrected all the way, unless the "
+        "request says otherwise; unset: what the model's card advises, for its lens.",
     )
     grid_points: int = Field(65, ge=9, le=257, description="Rows and columns of the grids that are made.")
 

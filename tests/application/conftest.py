@@ -1,8 +1,8 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -30,15 +30,15 @@ class Application:
     store: MemoryGridStore
 
 
-@pytest.fixture
-async def application(tmp_path: Path) -> AsyncIterator[Application]:
+@asynccontextmanager
+async def assembled(min_confidence: float | None) -> AsyncIterator[Application]:
     settings = Settings()
     meter, estimator, pool = RecordingMeter(), FakeEstimator(), FakeRenderPool()
     blocking = BlockingWork(2, settings.queue_frames, meter)
     codec, store = PillowCodec(settings), MemoryGridStore(settings)
     grids = FittedGrids(blocking, meter)
     estimation = Estimation(
-        estimator, codec, store, grids, blocking, meter, grid_points=settings.grid_points, min_confidence=0.5
+        estimator, codec, store, grids, blocking, meter, grid_points=settings.grid_points, min_confidence=min_confidence
     )
     correction = Correction(
         estimation, codec, store, grids, pool, blocking, meter, jpeg_quality=92, deadline_s=settings.render_deadline_s
@@ -46,6 +46,20 @@ async def application(tmp_path: Path) -> AsyncIterator[Application]:
     yield Application(estimation, correction, estimator, pool, meter, store)
     blocking.close()
     await store.close()
+
+
+@pytest.fixture
+async def application() -> AsyncIterator[Application]:
+    """With a threshold of 0.5."""
+    async with assembled(0.5) as application:
+        yield application
+
+
+@pytest.fixture
+async def advised() -> AsyncIterator[Application]:
+    """As careful as the card of the model advises."""
+    async with assembled(None) as application:
+        yield application
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tests.application.conftest import Application
+from tests.fakes import FAKE_MODEL
 from unbend_service.domain.errors import InvalidImage, InvalidOption
 from unbend_service.domain.fit import CROP
 from unbend_service.domain.guides import Guides
@@ -39,6 +40,22 @@ async def test_too_little_confidence_leaves_the_picture_alone_and_says_why(
     assert record.grid.displacement == 0
     asked_for = await application.estimation.of_image(jpeg, min_confidence=0.3)
     assert asked_for.outcome is Outcome.CORRECTED
+
+
+async def test_in_doubt_the_card_advises_a_little_and_a_threshold_overrules_it(
+    advised: Application, jpeg: bytes
+) -> None:
+    """The advice is for the lens: everything, when asked for, is corrected all the way."""
+    advised.estimator.confidence = 0.4
+    doubted = await advised.estimation.of_image(jpeg)
+    assert (doubted.outcome, doubted.reason) == (Outcome.CORRECTED, Reason.LOW_CONFIDENCE)
+    assert 0 < doubted.strength < 1
+    assert doubted.grid.displacement == pytest.approx(FAKE_MODEL.caution.doubtful_displacement, rel=1e-3)
+    for certain in (
+        await advised.estimation.of_image(jpeg, min_confidence=0.4),
+        await advised.estimation.of_image(jpeg, Correct.ALL),
+    ):
+        assert (certain.outcome, certain.reason, certain.strength) == (Outcome.CORRECTED, Reason.NONE, 1.0)
 
 
 async def test_straight_guides_leave_the_picture_alone(application: Application, jpeg: bytes) -> None:

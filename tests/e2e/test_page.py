@@ -219,6 +219,24 @@ def test_a_picture_that_was_left_alone_says_so_and_why(service: Server, visit: V
     assert difference(pixels_of(page, "after"), corrected(service, facade)) < SAME
 
 
+def test_a_doubtful_correction_says_how_much_of_it_is_applied(service: Server, visit: Visit, facade: Path) -> None:
+    """The grid is drawn as it came; who knows better may have all of it."""
+    page = visit(f"http://{service.http}/")
+    record = json.loads(post(service, "/v1/estimate?min_confidence=0&strength=0.25", facade.read_bytes()))
+    doubted = record | {"reason": "low_confidence", "confidence": 0.4}
+    page.route("**/v1/estimate", lambda route: route.fulfill(json=doubted))
+    open_picture(page, facade)
+    assert page.inner_text("#verdict") == "Straightened a little"
+    assert re.search(r"is 40\s% sure .* In doubt only 25\s% of the correction is applied", page.inner_text("#why"))
+    assert difference(pixels_of(page, "after"), corrected(service, facade, "&strength=0.25")) < SAME
+    assert page.inner_text("#anyway") == "Correct it all the way"
+    shoot(page, "doubtful")
+    page.click("#anyway")
+    settle(page)
+    assert re.search(r"would have applied 25\s% of it", page.inner_text("#why"))
+    assert difference(pixels_of(page, "after"), corrected(service, facade)) < SAME
+
+
 def test_a_file_that_is_no_picture_is_refused_with_a_sentence(
     service: Server, visit: Visit, facade: Path, tmp_path: Path
 ) -> None:

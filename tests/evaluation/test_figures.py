@@ -18,7 +18,7 @@ from unbend_service.evaluation.peers import floor_of
 from unbend_service.evaluation.suites import SYNTHETIC, TABLE_ONE, Measurement, measure, run_suite
 from unbend_service.evaluation.tables import quality_table
 
-MEASURED = Measurement("barrel", 0, 6.0, 3.0, 4.0, 1.0, 2.0, 0.9, True, 1.0, 0.01)
+MEASURED = Measurement("barrel", 0, 6.0, 3.0, 4.0, 1.0, 1.0, 2.0, 2.0, 0.9, True, 1.0, 0.01)
 
 
 def photograph(source: str = "free") -> Photograph:

@@ -52,7 +52,9 @@ def measurement(**changes: object) -> Measurement:
         error_px=3.0,
         lens_nothing_px=4.0,
         lens_px=1.0,
+        applied_px=1.0,
         moved_px=2.0,
+        applied_moved_px=2.0,
         confidence=0.9,
         applies=True,
         expected_error_px=1.0,
@@ -66,8 +68,8 @@ def test_removed_distortion_is_averaged_over_bent_cameras() -> None:
     rows = tables.lens_rows(
         [
             measurement(group="rational-1"),
-            measurement(group="fisheye-1", applies=False),
-            measurement(group="straight-1", lens_nothing_px=0.0, lens_px=0.3, applies=False),
+            measurement(group="fisheye-1", applied_px=4.0),
+            measurement(group="straight-1", lens_nothing_px=0.0, lens_px=0.3, applied_px=0.0),
         ]
     )
     assert tables.removed_share(rows, applied=False) == pytest.approx(0.75)
@@ -77,9 +79,9 @@ def test_removed_distortion_is_averaged_over_bent_cameras() -> None:
 
 def test_harm_is_counted_where_it_is_applied() -> None:
     """Not what was estimated and discarded."""
-    harmed = measurement(group="straight-1", lens_nothing_px=0.0, lens_px=0.3)
+    harmed = measurement(group="straight-1", lens_nothing_px=0.0, lens_px=0.3, applied_px=0.3)
     assert tables.lens_rows([harmed])[0].harmed == 1
-    assert tables.lens_rows([dataclasses.replace(harmed, applies=False)])[0].harmed == 0
+    assert tables.lens_rows([dataclasses.replace(harmed, applied_px=0.0)])[0].harmed == 0
 
 
 def test_the_oblique_ratio_compares_twins() -> None:

@@ -61,7 +61,15 @@ def test_guides_fitted_to_the_truth_have_hardly_an_error(family: str) -> None:
 
 def measurement(error: float, displacement: float, *, better: bool) -> Measurement:
     return Measurement(
-        "barrel", 5.0, 2.0, 2.0, 1.0 if better else 3.0, Evidence(error, displacement, 0.1, 50, 0.1, 0.0, 0.0), 0.9
+        family="barrel",
+        overall_nothing=5.0,
+        overall=2.0,
+        nonlinear_nothing=2.0,
+        nonlinear=1.0 if better else 3.0,
+        applied=2.0,
+        strength=0.0,
+        evidence=Evidence(error, displacement, 0.1, 50, 0.1, 0.0, 0.0),
+        confidence=0.9,
     )
 
 
@@ -83,5 +91,5 @@ def test_reliability_compares_what_was_said_with_what_happened() -> None:
 
 def test_the_table_has_the_do_nothing_line_beside_every_figure() -> None:
     """What is left alone counts as doing nothing."""
-    text = table([measurement(1.0, 1.0, better=True)], np.zeros((0, 2)), 0.95, "a title")
+    text = table([measurement(1.0, 1.0, better=True)], "a title")
     assert "| barrel | 1 | 5.00 | 2.00 | 2.00 | 2.00 | 1.00 | 1.00 | 2.00 | 0.00 | 0.00 |" in text

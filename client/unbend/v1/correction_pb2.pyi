@@ -125,7 +125,9 @@ class CorrectRequest(_message.Message):
     grid_id: _builtins.str
     """A stored grid to be used instead of an estimate."""
     min_confidence: _builtins.float
-    """Below this confidence, 0..1, the picture is left alone; absent means the server's setting."""
+    """Below this confidence, 0..1, the picture is left alone, from it on corrected all the way; absent means the
+    server's setting, or what its model advises: in doubt, a little.
+    """
     answer_format: _frame_pb2.PixelFormat.ValueType
     """Layout of the answer if an encoded picture is to come back in another encoded format; unspecified: that of format."""
     camera: _builtins.str
@@ -258,7 +260,9 @@ class StreamOpen(_message.Message):
     delivery: Global___Delivery.ValueType
     """What happens when frames come faster than they are rendered."""
     min_confidence: _builtins.float
-    """Below this confidence, 0..1, the stream is left alone; absent means the server's setting."""
+    """Below this confidence, 0..1, the stream is left alone, from it on corrected all the way; absent means the server's
+    setting, or what its model advises: in doubt, a little.
+    """
     estimate_again: _builtins.bool
     """Estimate anew although the stream id has a grid."""
     @_builtins.property

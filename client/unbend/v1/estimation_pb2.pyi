@@ -40,7 +40,9 @@ class EstimateRequest(_message.Message):
     strength: _builtins.float
     """0..1; absent means 1."""
     min_confidence: _builtins.float
-    """Below this confidence, 0..1, the picture is left alone; absent means the server's setting."""
+    """Below this confidence, 0..1, the picture is left alone, from it on corrected all the way; absent means the
+    server's setting, or what its model advises: in doubt, a little.
+    """
     camera: _builtins.str
     """Whose picture it is, 1 to 128 letters, digits and . _ : @ / + -: what pictures of one camera say of its lens adds
     up. "exif" takes make, model, lens and focal length from the file. Empty: the picture stands alone.
@@ -180,22 +182,30 @@ class Model(_message.Message):
     NAME_FIELD_NUMBER: _builtins.int
     SHA256_FIELD_NUMBER: _builtins.int
     MIN_CONFIDENCE_FIELD_NUMBER: _builtins.int
+    FULL_CONFIDENCE_FIELD_NUMBER: _builtins.int
+    DOUBTFUL_DISPLACEMENT_FIELD_NUMBER: _builtins.int
     name: _builtins.str
     """Short name."""
     sha256: _builtins.str
     """Of the weight file, lower-case hexadecimal."""
     min_confidence: _builtins.float
     """0..1, below which its card advises to leave a picture's lens alone."""
+    full_confidence: _builtins.float
+    """0..1, from which on it advises to correct the lens all the way; between the two, in part. Unset: min_confidence."""
+    doubtful_displacement: _builtins.float
+    """By how much such a part may displace the picture, on average; half picture widths."""
     def __init__(
         self,
         *,
         name: _builtins.str = ...,
         sha256: _builtins.str = ...,
         min_confidence: _builtins.float = ...,
+        full_confidence: _builtins.float = ...,
+        doubtful_displacement: _builtins.float = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["min_confidence", b"min_confidence", "name", b"name", "sha256", b"sha256"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["doubtful_displacement", b"doubtful_displacement", "full_confidence", b"full_confidence", "min_confidence", b"min_confidence", "name", b"name", "sha256", b"sha256"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

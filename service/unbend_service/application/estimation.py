@@ -12,7 +12,7 @@ from unbend_service.application.grey import grey_of_frame
 from unbend_service.application.known import HASHED_AT_ONCE_BYTES, Known, digest
 from unbend_service.application.ports import Bytes, Estimate, Estimator, GridStore, ImageCodec, Meter
 from unbend_service.domain.aggregation import Look, fuse
-from unbend_service.domain.decision import decide
+from unbend_service.domain.decision import TRUSTING, Caution, decide
 from unbend_service.domain.errors import InvalidOption, NotServedHere
 from unbend_service.domain.fit import KEEP, Fit
 from unbend_service.domain.frames import Frame
@@ -49,8 +49,9 @@ class Estimation:
     A picture that was seen before, or is being looked at, is not looked at again.
 
     Args:
-        min_confidence: below which a picture is left alone; None takes the estimator's advice, which speaks of the lens
-            and is therefore not followed where the whole of the map was asked for.
+        min_confidence: below which a picture is left alone, and from which on it is corrected all the way; None takes
+            the estimator's advice, which speaks of the lens and is therefore not followed where the whole of the map
+            was asked for.
         known_images: pictures whose estimate is kept.
         elsewhere: where calls of the estimator wait if it is on another node; they take no core here.
     """
@@ -93,7 +94,7 @@ class Estimation:
 
     async def record(self, estimate: Estimate, correct: Correct, min_confidence: float | None = None) -> GridRecord:
         """The decision on an estimate, at full strength and without fit; stored and counted."""
-        threshold = self._threshold(estimate, correct, min_confidence)
+        caution = self._caution(estimate, correct, min_confidence)
         record = await self._blocking.run(
             "grid",
             decide,
@@ -102,19 +103,18 @@ class Estimation:
             estimate.confidence_kind,
             estimate.model.name,
             correct=correct,
-            min_confidence=threshold,
+            caution=caution,
             points=self._grid_points,
         )
         self._meter.estimate(record.outcome.value)
         await self._store.put(record)
         return record
 
-    def _threshold(self, estimate: Estimate, correct: Correct, asked: float | None) -> float:
-        if asked is not None:
-            return check_confidence(asked)
-        if self._min_confidence is not None:
-            return self._min_confidence
-        return estimate.model.min_confidence if correct is Correct.NONLINEAR else 0.0
+    def _caution(self, estimate: Estimate, correct: Correct, asked: float | None) -> Caution:
+        threshold = self._min_confidence if asked is None else check_confidence(asked)
+        if threshold is not None:
+            return Caution(threshold, threshold)
+        return estimate.model.caution if correct is Correct.NONLINEAR else TRUSTING
 
     async def of_image(
         self,

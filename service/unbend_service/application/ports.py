@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from unbend_service.application.exhibit import Exhibit, Subject
 from unbend_service.domain.access import Grant
+from unbend_service.domain.decision import TRUSTING, Caution
 from unbend_service.domain.exchange import DenseMap, ExportedFile, ExportFormat, ImportFormat
 from unbend_service.domain.frames import Border, Frame
 from unbend_service.domain.grid import Grid
@@ -29,12 +30,12 @@ class ModelInfo:
     Attributes:
         name: short name, as the setting ``model`` takes it.
         sha256: of the weight file, lower-case hex.
-        min_confidence: 0..1, below which its card advises to leave a picture's lens alone.
+        caution: that its card advises for a picture's lens.
     """
 
     name: str
     sha256: str
-    min_confidence: float = 0.0
+    caution: Caution = TRUSTING
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from unbend_service.application.correction import CorrectedImage, CorrectOptions
 from unbend_service.cli.batch_run import correct_jobs, report_batch
 from unbend_service.cli.batches import find_jobs, is_batch
 from unbend_service.cli.private import private_service
-from unbend_service.cli.reporting import console, errors_reported, fail, print_json
+from unbend_service.cli.reporting import console, decision, errors_reported, fail, print_json
 from unbend_service.cli.serve import read_settings
 from unbend_service.domain.errors import InvalidOption
 from unbend_service.domain.fit import Fit, check_strength
@@ -35,7 +35,8 @@ def correct(
     strength: Annotated[float, typer.Option(help="0..1, blend with the original.")] = 1.0,
     quality: Annotated[int | None, typer.Option(min=1, max=100, help="Quality of jpeg and webp.")] = None,
     min_confidence: Annotated[
-        float | None, typer.Option(min=0, max=1, help="Leave the picture alone below this confidence.")
+        float | None,
+        typer.Option(min=0, max=1, help="Leave the picture alone below this confidence, else correct all the way."),
     ] = None,
     camera: Annotated[
         str | None, typer.Option(help="All photographs are of one camera: a name of yours; exif: as the files say.")
@@ -97,6 +98,4 @@ def _report(result: CorrectedImage, target: Path, as_json: bool) -> None:
         summary = {key: value for key, value in record.to_dict().items() if key not in ("grid", "guides")}
         print_json({**summary, "out": str(target), "format": result.image_format})
         return
-    reason = f" ({record.reason.value.replace('_', ' ')})" if record.reason else ""
-    outcome = record.outcome.value.replace("_", " ")
-    console.print(f"{target}: {outcome}{reason}, confidence {record.confidence:.2f}, grid {record.id}", soft_wrap=True)
+    console.print(f"{target}: {decision(record)}, confidence {record.confidence:.2f}, grid {record.id}", soft_wrap=True)

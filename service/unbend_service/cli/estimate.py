@@ -10,7 +10,7 @@ import typer
 from rich.table import Table
 
 from unbend_service.cli.private import private_service
-from unbend_service.cli.reporting import console, errors_reported, print_json
+from unbend_service.cli.reporting import console, decision, errors_reported, print_json
 from unbend_service.cli.serve import read_settings
 from unbend_service.domain.fit import Fit
 from unbend_service.domain.records import Correct, GridRecord
@@ -43,9 +43,7 @@ async def _estimate(settings: Settings, body: bytes, correct: Correct, fit: Fit,
 
 def _print(record: GridRecord) -> None:
     table = Table(show_header=False, box=None, pad_edge=False)
-    outcome = record.outcome.value.replace("_", " ")
-    reason = f" ({record.reason.value.replace('_', ' ')})" if record.reason else ""
-    table.add_row("outcome", outcome + reason)
+    table.add_row("outcome", decision(record))
     table.add_row("confidence", f"{record.confidence:.2f} ({record.confidence_kind.replace('_', ' ')})")
     table.add_row("displacement", f"{record.grid.displacement * 50:.2f} % of the width, mean")
     table.add_row("grid", f"{record.id} ({record.grid.rows}x{record.grid.columns})")

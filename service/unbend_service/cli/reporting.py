@@ -14,6 +14,7 @@ import typer
 from rich.console import Console
 
 from unbend_service.domain.errors import InvalidInput, UnbendError
+from unbend_service.domain.records import GridRecord
 
 EXIT_FAILED = 1
 EXIT_INVALID_INPUT = 3
@@ -44,3 +45,11 @@ def errors_reported() -> Iterator[None]:
         fail(str(error))
     except OSError as error:
         fail(f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}")
+
+
+def decision(record: GridRecord) -> str:
+    """Of an estimate, in words: the outcome, how much of it, and why no more."""
+    outcome = record.outcome.value.replace("_", " ")
+    share = f", {record.strength:.0%} of it" if 0 < record.strength < 1 else ""
+    reason = f" ({record.reason.value.replace('_', ' ')})" if record.reason else ""
+    return outcome + share + reason

@@ -11,7 +11,7 @@ import typer
 from unbend_service.adapters.video.encoders import VideoCodec
 from unbend_service.application.correction import CorrectOptions
 from unbend_service.cli.grid_source import load_record
-from unbend_service.cli.reporting import errors, errors_reported, fail, print_json
+from unbend_service.cli.reporting import decision, errors, errors_reported, fail, print_json
 from unbend_service.cli.serve import read_settings
 from unbend_service.cli.server import Server, reaches_server
 from unbend_service.cli.video_run import Result, Wish, run
@@ -30,7 +30,8 @@ def video(
     fit: Annotated[str, typer.Option(help="keep, crop, full, or a number 0..1 between crop and full.")] = "crop",
     strength: Annotated[float, typer.Option(help="0..1, blend with the original.")] = 1.0,
     min_confidence: Annotated[
-        float | None, typer.Option(min=0, max=1, help="Leave the video alone below this confidence.")
+        float | None,
+        typer.Option(min=0, max=1, help="Leave the video alone below this confidence, else correct all the way."),
     ] = None,
     grid: Annotated[str | None, typer.Option(help="A JSON file or an id: that grid instead of an estimate.")] = None,
     estimate_frames: Annotated[
@@ -101,13 +102,11 @@ def _report(result: Result, wish: Wish, as_json: bool) -> None:
         return
     for note in result.notes:
         errors.print("note:", note, style="yellow", markup=False, highlight=False, soft_wrap=True)
-    reason = f" ({record.reason.value.replace('_', ' ')})" if record.reason else ""
-    outcome = record.outcome.value.replace("_", " ")
     ended = (", copied without encoding it again" if result.copied else "") + (
         ", interrupted" if result.interrupted else ""
     )
     errors.print(
-        f"{wish.target}: {result.frames} frames at {fps:.1f} a second, {outcome}{reason}, grid {record.id}{ended}",
+        f"{wish.target}: {result.frames} frames at {fps:.1f} a second, {decision(record)}, grid {record.id}{ended}",
         markup=False,
         highlight=False,
         soft_wrap=True,

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from unbend_service.application.ports import Estimator
-from unbend_service.domain.decision import decide
+from unbend_service.domain.decision import TRUSTING, Caution, decide
 from unbend_service.domain.grid import Grid
 from unbend_service.domain.guides import Guides
 from unbend_service.domain.records import Correct, Outcome
@@ -28,9 +28,10 @@ class Look:
 
     Attributes:
         guides: None where it has none.
-        lens, everything: the grids of `correct=nonlinear` and `correct=all`, before any threshold.
+        lens, everything: the grids of `correct=nonlinear` and `correct=all`, whatever the confidence.
+        applied: the grid of `correct=nonlinear` with the caution that the model's card advises, as the service uses it.
         confidence: 0..1.
-        applies: whether the service, at the threshold that the model's card advises, would correct the lens.
+        applies: whether that corrects anything.
         expected_error_px: of the lens, px at 256 wide; None where the method has no say.
         seconds: that the look took.
     """
@@ -38,6 +39,7 @@ class Look:
     guides: Guides | None
     lens: Grid
     everything: Grid
+    applied: Grid
     confidence: float
     applies: bool
     expected_error_px: float | None
@@ -51,17 +53,17 @@ class Method:
     Attributes:
         name: in tables.
         look: what it makes of a case; peers that know the truth are told it, models see the picture alone.
-        min_confidence: that its card advises.
+        caution: that its card advises.
     """
 
     name: str
     look: Callable[[Case], Look]
-    min_confidence: float
+    caution: Caution
 
 
 def model_method(estimator: Estimator, name: str | None = None) -> Method:
     """An estimator, decided on as in the service."""
-    threshold = estimator.model.min_confidence
+    caution = estimator.model.caution
 
     def look(case: Case) -> Look:
         started = time.perf_counter()
@@ -70,12 +72,12 @@ def model_method(estimator: Estimator, name: str | None = None) -> Method:
         return decided(
             estimate.guides,
             estimate.confidence,
-            threshold,
+            caution,
             None if estimate.expected_error is None else estimate.expected_error * 128,
             seconds,
         )
 
-    return Method(name or estimator.model.name, look, threshold)
+    return Method(name or estimator.model.name, look, caution)
 
 
 def guides_method(name: str, examine: Callable[[Case], Guides]) -> Method:
@@ -84,9 +86,9 @@ def guides_method(name: str, examine: Callable[[Case], Guides]) -> Method:
     def look(case: Case) -> Look:
         started = time.perf_counter()
         guides = examine(case)
-        return decided(guides, 1.0, 0.0, None, time.perf_counter() - started)
+        return decided(guides, 1.0, TRUSTING, None, time.perf_counter() - started)
 
-    return Method(name, look, 0.0)
+    return Method(name, look, TRUSTING)
 
 
 def peer_methods(estimator: Estimator) -> list[Method]:
@@ -110,7 +112,8 @@ def peer_methods(estimator: Estimator) -> list[Method]:
 
 def doing_nothing() -> Method:
     identity = Grid.identity(GRID_POINTS, GRID_POINTS)
-    return Method("doing nothing", lambda case: Look(None, identity, identity, 1.0, False, 0.0, 0.0), 0.0)
+    look = Look(None, identity, identity, identity, 1.0, False, 0.0, 0.0)
+    return Method("doing nothing", lambda case: look, TRUSTING)
 
 
 def knowing_the_truth() -> Method:
@@ -120,18 +123,22 @@ def knowing_the_truth() -> Method:
         grid = Grid.from_map(
             lambda target: np.nan_to_num(case.truth(target), nan=8.0).clip(-8, 8), GRID_POINTS, GRID_POINTS
         )
-        return Look(None, grid, grid, 1.0, True, 0.0, 0.0)
+        return Look(None, grid, grid, grid, 1.0, True, 0.0, 0.0)
 
-    return Method("the true map", look, 0.0)
+    return Method("the true map", look, TRUSTING)
 
 
 def decided(
-    guides: Guides, confidence: float, threshold: float, expected_error_px: float | None, seconds: float
+    guides: Guides, confidence: float, caution: Caution, expected_error_px: float | None, seconds: float
 ) -> Look:
     """An estimate as the service decides on it."""
-    lens, everything = (
-        decide(guides, confidence, "", "", correct=correct, min_confidence=0.0, points=GRID_POINTS)
-        for correct in (Correct.NONLINEAR, Correct.ALL)
+    lens, everything, applied = (
+        decide(guides, confidence, "", "", correct=correct, caution=careful, points=GRID_POINTS)
+        for correct, careful in (
+            (Correct.NONLINEAR, TRUSTING),
+            (Correct.ALL, TRUSTING),
+            (Correct.NONLINEAR, caution),
+        )
     )
-    applies = confidence >= threshold and lens.outcome is Outcome.CORRECTED
-    return Look(guides, lens.grid, everything.grid, confidence, applies, expected_error_px, seconds)
+    applies = applied.outcome is Outcome.CORRECTED
+    return Look(guides, lens.grid, everything.grid, applied.grid, confidence, applies, expected_error_px, seconds)

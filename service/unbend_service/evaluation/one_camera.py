@@ -47,7 +47,7 @@ def together(looks: Sequence[Look], method: Method) -> Look:
         ]
     )
     error_px = fused.expected_error * _PIXELS
-    return decided(fused.guides, fused.confidence, method.min_confidence, error_px, sum(look.seconds for look in looks))
+    return decided(fused.guides, fused.confidence, method.caution, error_px, sum(look.seconds for look in looks))
 
 
 def camera_rows(measurements: Sequence[Measurement]) -> list[tuple[str, float, float, float]]:

@@ -26,6 +26,7 @@ ONE_CAMERA, DRAWN_LENSES = "one-camera", "drawn-lenses"
 SUITES = (SYNTHETIC, NO_HARM, REAL_LENSES, OBLIQUE, ONE_CAMERA, TABLE_ONE)
 """Of photographs. `DRAWN_LENSES` needs drawn scenes besides."""
 _WHOLE_LONG_SIDE_PX = 512
+_EVERYWHERE = target_lattice(33, 33).reshape(-1, 2)
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,8 @@ class Measurement:
         picture: number of the picture in its suite, the same for every method.
         nothing_px, error_px: EPE of everything, of doing nothing and of `correct=all`.
         lens_nothing_px, lens_px: the same up to a homography, of doing nothing and of `correct=nonlinear`.
-        moved_px: mean displacement by `correct=nonlinear`.
+        applied_px: of the lens as the service leaves it, with the caution that the model's card advises.
+        moved_px, applied_moved_px: mean displacement by `correct=nonlinear`, as estimated and as applied.
         confidence, applies, expected_error_px, seconds: see :class:`~.methods.Look`.
         ssim_nothing, ssim, mse_nothing, mse: of the picture corrected with `all`; None where there is no original.
     """
@@ -48,7 +50,9 @@ class Measurement:
     error_px: float
     lens_nothing_px: float
     lens_px: float
+    applied_px: float
     moved_px: float
+    applied_moved_px: float
     confidence: float
     applies: bool
     expected_error_px: float | None
@@ -57,11 +61,6 @@ class Measurement:
     ssim: float | None = None
     mse_nothing: float | None = None
     mse: float | None = None
-
-    @property
-    def applied_px(self) -> float:
-        """Error of the lens as the service leaves it: corrected above the threshold, else as it was."""
-        return self.lens_px if self.applies else self.lens_nothing_px
 
 
 #: Called with a case, its number and the look at it: figures are made of them.
@@ -144,6 +143,12 @@ def measure(
     nothing_px, lens_nothing_px = nothing or errors_of_nothing(case)
     error_px = float(np.hypot(*((everything(target) - truth) * half_px).T).mean())
     _, lens_px = map_errors(lens, target, truth, half_px)
+    moved_px = displacement_px(lens, _EVERYWHERE, half_px)
+    applied_px, applied_moved_px = (lens_px, moved_px) if look.applies else (lens_nothing_px, 0.0)
+    if look.applies and look.applied.id != look.lens.id:
+        applied = as_rendered(look.applied)
+        _, applied_px = map_errors(applied, target, truth, half_px)
+        applied_moved_px = displacement_px(applied, _EVERYWHERE, half_px)
     ssim_nothing = ssim = mse_nothing = mse = None
     if quality and case.original is not None:
         ssim_nothing, mse_nothing = ssim_and_mse(case.picture, case.original, case.shown)
@@ -155,7 +160,9 @@ def measure(
         error_px=error_px,
         lens_nothing_px=lens_nothing_px,
         lens_px=lens_px,
-        moved_px=displacement_px(lens, target_lattice(33, 33).reshape(-1, 2), half_px),
+        applied_px=applied_px,
+        moved_px=moved_px,
+        applied_moved_px=applied_moved_px,
         confidence=look.confidence,
         applies=look.applies,
         expected_error_px=look.expected_error_px,

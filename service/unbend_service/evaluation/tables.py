@@ -238,17 +238,18 @@ def harm_at(
     """At a confidence (None: as applied): displacements of undistorted pictures; of the pictures that are bent by more
     than BENT_PX the share that is corrected, their mean error then, and that of doing nothing."""
 
-    def used(own: Sequence[Measurement]) -> np.typing.NDArray[np.bool_]:
-        return np.array([m.applies if threshold is None else m.confidence >= threshold for m in own], bool)
-
-    moved = np.where(used(undistorted), _all(undistorted, "moved_px"), 0.0)
     strong = [m for m in bent if m.lens_nothing_px > BENT_PX]
+    nothing = _all(strong, "lens_nothing_px")
+    if threshold is None:
+        moved, error = _all(undistorted, "applied_moved_px"), _all(strong, "applied_px")
+        corrected = _all(strong, "applies") > 0
+    else:
+        corrected = _all(strong, "confidence") >= threshold
+        error = np.where(corrected, _all(strong, "lens_px"), nothing)
+        moved = np.where(_all(undistorted, "confidence") >= threshold, _all(undistorted, "moved_px"), 0.0)
     if not strong:
         return moved, float("nan"), float("nan"), float("nan")
-    corrected = used(strong)
-    nothing = _all(strong, "lens_nothing_px")
-    left = np.where(corrected, _all(strong, "lens_px"), nothing)
-    return moved, float(corrected.mean()), float(left.mean()), float(nothing.mean())
+    return moved, float(corrected.mean()), float(error.mean()), float(nothing.mean())
 
 
 def _all(measurements: Sequence[Measurement], name: str) -> np.typing.NDArray[np.float64]:

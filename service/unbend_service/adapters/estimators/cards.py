@@ -1,8 +1,9 @@
 """Model cards: what a weight file is, read from the ``.json`` that lies beside it.
 
-A card is ``{"name", "kind", "sha256", "min_confidence", "parameters"}``: ``kind`` says which estimator reads the
-weights, ``sha256`` is that of the ``.onnx`` file, ``min_confidence`` (0 if left out) is the advised threshold, and
-``parameters`` are the estimator's own.
+A card is ``{"name", "kind", "sha256", "min_confidence", "full_confidence", "doubtful_px", "parameters"}``: ``kind``
+says which estimator reads the weights, ``sha256`` is that of the ``.onnx`` file, and ``parameters`` are the estimator's
+own. Below ``min_confidence`` (0 if left out) a picture's lens had better be left alone; below ``full_confidence`` (the
+same if left out) be corrected by a mean displacement of ``doubtful_px`` at most, pixels of a picture 256 wide.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from unbend_service.domain.decision import Caution
 from unbend_service.domain.errors import ModelUnavailable
 
 SETTING = "model"
@@ -27,7 +29,7 @@ class ModelCard:
         name: as the setting ``model`` takes it.
         kind: which estimator reads the weights, a key of the catalogue.
         sha256: of the weight file, lower-case hex.
-        min_confidence: 0..1, below which a picture's lens had better be left alone.
+        caution: that is advised for a picture's lens.
         parameters: what that estimator wants to know besides.
         weights: the ``.onnx`` file.
     """
@@ -35,7 +37,7 @@ class ModelCard:
     name: str
     kind: str
     sha256: str
-    min_confidence: float
+    caution: Caution
     parameters: dict[str, Any]
     weights: Path
 
@@ -66,7 +68,7 @@ def read_card(model: str) -> ModelCard:
             name=str(fields["name"]),
             kind=str(fields["kind"]),
             sha256=str(fields["sha256"]),
-            min_confidence=float(fields.get("min_confidence", 0.0)),
+            caution=_caution(fields),
             parameters=dict(fields.get("parameters", {})),
             weights=weights,
         )
@@ -76,6 +78,11 @@ def read_card(model: str) -> ModelCard:
         raise _unavailable(f"The card {path.name!r} cannot be read: {error!r}.") from error
     _check(weights, card.sha256)
     return card
+
+
+def _caution(fields: dict[str, Any]) -> Caution:
+    least = float(fields.get("min_confidence", 0.0))
+    return Caution(least, float(fields.get("full_confidence", least)), float(fields.get("doubtful_px", 0.0)) * 2 / 256)
 
 
 def companion(card: ModelCard, part: str) -> Path:

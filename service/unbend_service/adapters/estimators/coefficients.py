@@ -47,7 +47,7 @@ class CoefficientsEstimator:
                 setting="model",
             )
         self._height, self._width = int(shape[2]), int(shape[3])
-        self._model = ModelInfo(card.name, card.sha256, card.min_confidence)
+        self._model = ModelInfo(card.name, card.sha256, card.caution)
 
     @property
     def model(self) -> ModelInfo:

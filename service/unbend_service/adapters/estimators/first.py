@@ -54,7 +54,7 @@ class FirstEstimator:
                 setting="model",
             )
         self._height, self._width = int(shape[2]), int(shape[3])
-        self._model = ModelInfo(card.name, card.sha256, card.min_confidence)
+        self._model = ModelInfo(card.name, card.sha256, card.caution)
 
     @property
     def model(self) -> ModelInfo:

@@ -117,7 +117,7 @@ class LinesetEstimator:
                 f"The weights of {card.name!r} take {features} and give {values}, not what the card says.",
                 setting="model",
             )
-        self._model = ModelInfo(card.name, card.sha256, card.min_confidence)
+        self._model = ModelInfo(card.name, card.sha256, card.caution)
 
     @property
     def model(self) -> ModelInfo:

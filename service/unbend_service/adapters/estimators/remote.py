@@ -11,6 +11,7 @@ import numpy as np
 
 from unbend.v1 import estimation_pb2, estimation_pb2_grpc, frame_pb2, grid_pb2
 from unbend_service.application.ports import Bytes, Estimate, ModelInfo
+from unbend_service.domain.decision import Caution
 from unbend_service.domain.errors import EstimatorUnavailable, InvalidGuides, QueueFull
 from unbend_service.domain.guides import GuideFamily, Guides
 
@@ -102,7 +103,8 @@ class RemoteEstimator:
 
     def _read(self, response: estimation_pb2.EstimateGuidesResponse) -> Estimate:
         said = response.model
-        self._model = ModelInfo(said.name, said.sha256, said.min_confidence)
+        caution = Caution(said.min_confidence, said.full_confidence, said.doubtful_displacement)
+        self._model = ModelInfo(said.name, said.sha256, caution)
         return Estimate(
             Guides(_family(response.guides.rows), _family(response.guides.columns)),
             response.confidence,

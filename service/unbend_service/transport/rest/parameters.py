@@ -42,7 +42,8 @@ ConfidenceQuery = Annotated[
         ge=0,
         le=1,
         allow_inf_nan=False,
-        description="Below this confidence the picture is left alone; the setting `min_confidence` if not given.",
+        description="Below this confidence the picture is left alone, from it on corrected all the way; if not given "
+        "the setting `min_confidence`, or what the model advises: in doubt, a little.",
     ),
 ]
 BorderQuery = Annotated[

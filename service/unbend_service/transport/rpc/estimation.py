@@ -56,6 +56,10 @@ class EstimationServicer(estimation_pb2_grpc.EstimationServiceServicer):
             confidence_kind=estimate.confidence_kind,
             expected_error=estimate.expected_error,
             model=estimation_pb2.Model(
-                name=estimate.model.name, sha256=estimate.model.sha256, min_confidence=estimate.model.min_confidence
+                name=estimate.model.name,
+                sha256=estimate.model.sha256,
+                min_confidence=estimate.model.caution.min_confidence,
+                full_confidence=estimate.model.caution.full_confidence,
+                doubtful_displacement=estimate.model.caution.doubtful_displacement,
             ),
         )

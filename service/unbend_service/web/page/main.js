@@ -7,7 +7,7 @@ import { Overlay, drawOverlays } from "./overlays.js";
 import { decode } from "./picture.js";
 import { createRenderer } from "./renderer.js";
 import { createSplit } from "./slider.js";
-import { derive, isLeftAlone, open, state, subscribe, update } from "./state.js";
+import { derive, isDoubted, isLeftAlone, open, state, subscribe, update } from "./state.js";
 import { downloadPicture, exports, snippets, storedGrid } from "./taking.js";
 import { facts, verdict } from "./verdict.js";
 
@@ -106,7 +106,8 @@ function control(derived) {
   const { title, sentence } = verdict(state, derived), adjusting = state.view === "adjust";
   setText("verdict", title);
   setText("why", sentence);
-  get("anyway").hidden = !(isLeftAlone() && state.record.reason === "low_confidence" && state.record.guides);
+  get("anyway").hidden = !(isDoubted() && state.record.guides);
+  setText("anyway", isLeftAlone() ? "Correct it anyway" : "Correct it all the way");
   get("correction").hidden = isLeftAlone();
   get("strength").value = Math.round(state.strength * 100);
   setText("strength-value", `${Math.round(state.strength * 100)} %`);

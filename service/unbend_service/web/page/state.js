@@ -14,7 +14,7 @@ export const state = {
   record: null, // what /v1/estimate said
   guides: null, // as they are now
   edited: false,
-  anyway: false, // correct a picture that the service left alone
+  anyway: false, // follow an estimate that the service did not trust
   correct: "nonlinear",
   strength: 1,
   fit: 0, // null: keep
@@ -45,6 +45,11 @@ export function open(picture, record) {
 /** Whether the picture stays as it is. */
 export function isLeftAlone() {
   return state.record.outcome === "left_alone" && !state.edited && !state.anyway;
+}
+
+/** Whether the service did not trust the estimate enough to follow it all the way. */
+export function isDoubted() {
+  return state.record.reason === "low_confidence" && state.correct === "nonlinear" && !state.edited && !state.anyway;
 }
 
 /** Whether the grid in effect is, to the last bit, the one the service has under the id of its estimate. */

@@ -1,5 +1,7 @@
 // What was decided, in sentences.
 
+import { isDoubted } from "./state.js";
+
 const percent = (share) => `${Math.round(100 * share)}\u00a0%`;
 
 function trust({ confidence, confidence_kind: kind }) {
@@ -23,7 +25,8 @@ const ALONE = {
 /** @returns {{title: string, sentence: string}} */
 export function verdict(state, derived) {
   const { record } = state;
-  const weaker = derived.weakened < 1 ? ` Only ${percent(derived.weakened)} of the correction is applied; more would fold the picture.` : "";
+  const share = percent(derived.weakened);
+  const weaker = derived.weakened < 1 ? ` Only ${share} of the correction is applied; more would fold the picture.` : "";
   if (state.edited) return { title: "Straightened by hand", sentence: `The picture follows your guides.${weaker}` };
   if (record.outcome === "left_alone" && !state.anyway) {
     const [title, sentence] = ALONE[record.reason] ?? ["Left as it is", () => "Nothing was changed."];
@@ -31,7 +34,14 @@ export function verdict(state, derived) {
   }
   const moved = (derived.blended.displacement * state.picture.width) / 2;
   const moves = `On average a point moves by ${moved < 10 ? moved.toFixed(1) : Math.round(moved)}\u00a0pixels.`;
-  if (state.anyway) return { title: "Corrected at your word", sentence: `${moves} The service itself would have left the picture alone.` };
+  if (state.anyway) {
+    const itself = record.outcome === "left_alone" ? "left the picture alone" : `applied ${percent(record.strength)} of it`;
+    return { title: "Corrected at your word", sentence: `${moves} The service itself would have ${itself}.` };
+  }
+  if (isDoubted()) {
+    const doubt = `${trust(record)} In doubt only ${share} of the correction is applied.`;
+    return { title: "Straightened a little", sentence: `${moves} ${doubt}` };
+  }
   return { title: "Straightened", sentence: `${moves} ${trust(record)}${weaker}`.trim() };
 }
 
