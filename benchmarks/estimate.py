@@ -25,7 +25,7 @@ from unbend_service.adapters.estimators import lineset
 from unbend_service.adapters.estimators.catalogue import load_estimator
 from unbend_service.application.estimation import ESTIMATE_LONGEST_PX
 from unbend_service.cli.private import private_service
-from unbend_service.domain.decision import decide
+from unbend_service.domain.decision import TRUSTING, decide
 from unbend_service.domain.records import Correct
 from unbend_service.settings import Settings
 
@@ -105,7 +105,7 @@ def _parts(report: Report, body: bytes, runs: int, settings: Settings) -> None:
                 estimate.confidence_kind,
                 estimate.model.name,
                 correct=Correct.NONLINEAR,
-                min_confidence=0.0,
+                caution=TRUSTING,
                 points=settings.grid_points,
             )
             spent.end_turn()

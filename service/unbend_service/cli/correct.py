@@ -95,7 +95,7 @@ async def _correct(settings: Settings, body: bytes, options: CorrectOptions) -> 
 def _report(result: CorrectedImage, target: Path, as_json: bool) -> None:
     record = result.record
     if as_json:
-        summary = {key: value for key, value in record.to_dict().items() if key not in ("grid", "guides")}
+        summary = {key: value for key, value in record.provenance().items() if key != "guides"}
         print_json({**summary, "out": str(target), "format": result.image_format})
         return
     console.print(f"{target}: {decision(record)}, confidence {record.confidence:.2f}, grid {record.id}", soft_wrap=True)

@@ -95,7 +95,7 @@ def _report(result: Result, wish: Wish, as_json: bool) -> None:
     record = result.record
     fps = result.frames / max(result.seconds, 1e-9)
     if as_json:
-        summary = {key: value for key, value in record.to_dict().items() if key not in ("grid", "guides")}
+        summary = {key: value for key, value in record.provenance().items() if key != "guides"}
         counted = {"out": wish.target, "frames": result.frames, "seconds": result.seconds, "fps": fps}
         how = {"copied": result.copied, "interrupted": result.interrupted, "notes": result.notes}
         print_json({**summary, **counted, **how})

@@ -80,6 +80,10 @@ class GridRecord:
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of /v1/estimate and /v1/grids."""
+        return {**self.provenance(), "grid": self.grid.to_dict()}
+
+    def provenance(self) -> dict[str, Any]:
+        """The same without the grid."""
         return {
             "grid_id": self.id,
             "confidence": self.confidence,
@@ -88,7 +92,6 @@ class GridRecord:
             "reason": self.reason.value,
             "strength": self.strength,
             "guides": None if self.guides is None else self.guides.to_dict(),
-            "grid": self.grid.to_dict(),
             "model": self.model,
         }
 

@@ -5,7 +5,8 @@ import onnxruntime as ort
 import pytest
 
 from unbend_service.adapters.estimators.cards import companion, read_card
-from unbend_service.adapters.estimators.graph_parts import parted
+from unbend_service.adapters.estimators.graph_parts import headed, parted
+from unbend_service.adapters.estimators.views import mirrored_maps
 
 AWAITED = ("chain_nodes", "chain_spreads", "chain_state")
 
@@ -35,6 +36,25 @@ def test_both_parts_together_are_the_network(branch: bytes) -> None:
         assert np.array_equal(part, expected)
 
 
+def test_the_front_end_can_be_run_apart(branch: bytes) -> None:
+    """With its maps in place of the view the rest says the same; and those of the mirror image follow from them."""
+    random = np.random.default_rng(4)
+    parts = parted(branch, AWAITED)
+    assert parts is not None
+    heads = headed(parts.early, "/branch/front/")
+    assert heads is not None
+    early, front, trunk = session(parts.early), session(heads.early), session(heads.late)
+    picture = random.random((1, 1, 192, 192), dtype=np.float32)
+    extent = np.array([[1.0, 0.75]], np.float32)
+    (maps,) = front.run(heads.between, {"view": picture, "extent": extent})
+    (reflected,) = front.run(heads.between, {"view": np.ascontiguousarray(picture[..., ::-1]), "extent": extent})
+    np.testing.assert_allclose(mirrored_maps(np.asarray(maps)), reflected, atol=1e-5)
+    expected = early.run(parts.between, {"view": picture, "extent": extent})
+    said = trunk.run(parts.between, {heads.between[0]: maps, "extent": extent})
+    for part, whole in zip(said, expected, strict=True):
+        np.testing.assert_allclose(part, whole, atol=1e-5)
+
+
 def test_each_weight_is_in_one_part(branch: bytes) -> None:
     """Two parts take no more memory than the whole."""
     parts = parted(branch, AWAITED)
@@ -48,3 +68,5 @@ def test_what_cannot_be_parted_is_left_whole(branch: bytes) -> None:
     assert parted(branch, ("view", "extent", *AWAITED)) is None
     assert parted(branch, ()) is None
     assert parted(b"\xff" * 40, AWAITED) is None
+    assert headed(branch, "/elsewhere/") is None
+    assert headed(b"\xff" * 40, "/branch/front/") is None

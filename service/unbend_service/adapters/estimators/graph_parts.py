@@ -1,4 +1,5 @@
-"""An ONNX network in two parts: what can be computed before some of its inputs are known, and the rest.
+"""An ONNX network in two parts: what can be computed before some of its inputs are known, or the module that it begins
+with; and the rest.
 
 ONNX Runtime runs a network as a whole. Only the few fields of the format (``onnx.proto``, IR version 3 and later) that
 say how nodes hang together are read; protobuf carries everything else over as it is.
@@ -6,7 +7,7 @@ say how nodes hang together are read; protobuf carries everything else over as i
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -18,9 +19,11 @@ from google.protobuf.message_factory import GetMessageClass
 
 #: Nodes with graphs of their own, which see names of the outer one without saying so.
 _NESTED = frozenset({"If", "Loop", "Scan", "SequenceMap"})
+#: Lead to integers and back; they are named like the tensor before them, but serve the convolution behind it.
+_OF_INTEGERS = frozenset({"QuantizeLinear", "DequantizeLinear"})
 _FLOAT = 1
 _FIELDS: dict[str, dict[str, tuple[int, str, bool]]] = {
-    "Node": {"input": (1, "", True), "output": (2, "", True), "op_type": (4, "", False)},
+    "Node": {"input": (1, "", True), "output": (2, "", True), "name": (3, "", False), "op_type": (4, "", False)},
     "Tensor": {"name": (8, "", False)},
     "TensorType": {"elem_type": (1, "int", False)},
     "Type": {"tensor_type": (1, "TensorType", False)},
@@ -57,6 +60,29 @@ def parted(network: bytes, awaited: Collection[str]) -> Parts | None:
         network: a serialised ``ModelProto`` with its weights inside.
         awaited: inputs that are known late.
     """
+    waiting = set(awaited)
+
+    def early(node: Any) -> bool:
+        if waiting.isdisjoint(node.input):
+            return True
+        waiting.update(node.output)
+        return False
+
+    return _split(network, early)
+
+
+def headed(network: bytes, module: str) -> Parts | None:
+    """Splits off the module that a network begins with; None where it begins with none of that name.
+
+    Args:
+        network: a serialised ``ModelProto`` with its weights inside.
+        module: what the names of the module's nodes begin with, as exporting gave them.
+    """
+    return _split(network, lambda node: node.name.startswith(module) and node.op_type not in _OF_INTEGERS)
+
+
+def _split(network: bytes, is_early: Callable[[Any], bool]) -> Parts | None:
+    """None where it cannot be read, or where the first part would have nothing to go by or nothing to give."""
     try:
         whole = _model().FromString(network)
     except DecodeError:
@@ -64,18 +90,16 @@ def parted(network: bytes, awaited: Collection[str]) -> Parts | None:
     nodes = list(whole.graph.node)
     if any(node.op_type in _NESTED for node in nodes):
         return None
-    waiting, early, late = set(awaited), [], []
+    constants = [node for node in nodes if node.op_type == "Constant"]
+    begun: list[Any] = []
+    late: list[Any] = []
     for node in nodes:  # in topological order, as the format demands
-        if waiting.isdisjoint(node.input):
-            early.append(node)
-        else:
-            waiting.update(node.output)
-            late.append(node)
-    constants = [node for node in early if node.op_type == "Constant"]
-    begun = [node for node in early if node.op_type != "Constant"]
-    between = tuple(sorted({name for node in late for name in node.input} & {name for n in begun for name in n.output}))
+        if node.op_type != "Constant":
+            (begun if is_early(node) else late).append(node)
+    given = {name for node in begun for name in node.output}
+    between = tuple(sorted({name for node in late for name in node.input} & given))
     seen = {name for node in begun for name in node.input} & {value.name for value in whole.graph.input}
-    if not (between and seen and waiting.issuperset(value.name for value in whole.graph.output)):
+    if not (between and seen and given.isdisjoint(value.name for value in whole.graph.output)):
         return None
     return Parts(
         _network(whole, begun, constants, gives=between),

@@ -1,4 +1,4 @@
-"""The view of a picture that the picture branch of an estimator looks at."""
+"""The view of a picture that the picture branch of an estimator looks at, and what its front end makes of it."""
 
 from __future__ import annotations
 
@@ -29,3 +29,18 @@ def view_of(grey: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
     left, top = (VIEW_PX - columns) // 2, (VIEW_PX - rows) // 2
     view[top : top + rows, left : left + columns] = small
     return view
+
+
+def mirrored_maps(maps: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """What the front end would make of the mirror image, x -> -x.
+
+    Args:
+        maps: (n, 2 + 2 harmonics, rows, columns) float32: intensity, edge strength, then cosine and sine of each
+            harmonic of the gradient's direction, as `training.picture_network.OrientationFront` orders them.
+
+    Returns:
+        The same shape. A mirror turns the direction theta into pi - theta, and 2 k theta into -2 k theta.
+    """
+    reflected = np.ascontiguousarray(maps[..., ::-1])
+    reflected[:, 3::2] *= -1
+    return reflected

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import orjson
 
 from unbend_service.adapters.exchange import ffmpeg, lensfun, maps_npz, opencv_cameras, stmaps
+from unbend_service.application.record_json import record_json
 from unbend_service.domain.decision import spin_grid
 from unbend_service.domain.errors import InvalidGrid
 from unbend_service.domain.exchange import DenseMap, ExportedFile, ExportFormat, ImportFormat
@@ -34,7 +35,7 @@ class ExchangeFiles:
     """Port GridFiles. Stateless."""
 
     def write_record(self, record: GridRecord) -> ExportedFile:
-        return ExportedFile(orjson.dumps(record.to_dict()), "application/json", ".json")
+        return ExportedFile(record_json(record), "application/json", ".json")
 
     def read_record(self, body: bytes) -> GridRecord:
         try:

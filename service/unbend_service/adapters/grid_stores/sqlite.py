@@ -171,10 +171,8 @@ class SqliteGridStore:
         return GridStoreUnavailable(f"The grid store failed: {error}.", setting="grid_store_path")
 
     def _put(self, record: GridRecord) -> None:
-        provenance = record.to_dict()
-        del provenance["grid"]
-        grid = record.grid
-        row = (record.id, grid.rows, grid.columns, grid.source.astype("<f4").tobytes(), orjson.dumps(provenance))
+        grid, provenance = record.grid, orjson.dumps(record.provenance())
+        row = (record.id, grid.rows, grid.columns, grid.source.astype("<f4").tobytes(), provenance)
         self._connection.execute("INSERT OR REPLACE INTO grids VALUES (?, ?, ?, ?, ?, ?)", (*row, self._clock()))
         self._bound("grids")
 

@@ -21,9 +21,8 @@ class Unreadable(ValueError):
 
 def pack(record: GridRecord) -> bytes:
     """A line of JSON (version, provenance, size), then the lattice: (rows, columns, 2) little-endian float32."""
-    head = record.to_dict()
-    head["grid"] = {"rows": record.grid.rows, "columns": record.grid.columns}
-    head["version"] = VALUE_VERSION
+    size = {"rows": record.grid.rows, "columns": record.grid.columns}
+    head = {**record.provenance(), "grid": size, "version": VALUE_VERSION}
     return orjson.dumps(head) + b"\n" + record.grid.source.astype("<f4").tobytes()
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-import orjson
 from fastapi import Response
 from pydantic import BaseModel, ConfigDict, Field
 
+from unbend_service.application.record_json import record_json
 from unbend_service.domain.records import GridRecord
 
 _TEXT = {"type": "string"}
@@ -94,4 +94,4 @@ class GridRecordBody(_Model):
 
 def json_of(record: GridRecord, status: int = 200, headers: dict[str, str] | None = None) -> Response:
     """The record as JSON, in the shape of :class:`GridRecordBody`."""
-    return Response(orjson.dumps(record.to_dict()), status, media_type="application/json", headers=headers)
+    return Response(record_json(record), status, media_type="application/json", headers=headers)
