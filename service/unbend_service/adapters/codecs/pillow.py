@@ -10,14 +10,13 @@ from __future__ import annotations
 import io
 import threading
 import warnings
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
 import cv2
 import numpy as np
-from PIL import Image, ImageCms, ImageFile
+from PIL import Image, ImageFile
 from PIL.BmpImagePlugin import BmpImageFile
 from PIL.JpegImagePlugin import JpegImageFile, get_sampling
 from PIL.PngImagePlugin import PngImageFile
@@ -26,13 +25,22 @@ from PIL.WebPImagePlugin import WebPImageFile
 
 from unbend_service.adapters.codecs import exif
 from unbend_service.adapters.codecs.cameras import camera_name
-from unbend_service.adapters.codecs.jpegs import decode_luma, decode_rgb, encode_packed, encode_planes
+from unbend_service.adapters.codecs.jpegs import decode_luma, decode_rgb
 from unbend_service.adapters.codecs.planar_jpegs import PlanarJpegs
+from unbend_service.adapters.codecs.samples import bounded_profile, describes, flat, has_alpha, plain
 from unbend_service.adapters.codecs.signatures import announced_size, check_scans, sniff
+from unbend_service.adapters.codecs.writing import (
+    JPEG_FORMATS,
+    LONGEST_SIDE_PX,
+    SUBSAMPLING,
+    encode_jpeg,
+    metadata_of,
+    options_of,
+    picture_of,
+)
 from unbend_service.application.ports import Bytes, DecodedImage, ImageHeader, PictureOrigin
 from unbend_service.domain.errors import (
     ImageTooCostly,
-    InvalidFrame,
     InvalidImage,
     InvalidOption,
     TooManyPixels,
@@ -61,28 +69,13 @@ _UPRIGHT = {
 }
 _PIXEL_FORMATS = {"L": PixelFormat.GRAY8, "RGB": PixelFormat.RGB24, "RGBA": PixelFormat.RGBA}
 _MODES = {pixel_format: mode for mode, pixel_format in _PIXEL_FORMATS.items()}
-_RAW_MODES = {
-    PixelFormat.GRAY8: ("L", "L"),
-    PixelFormat.RGB24: ("RGB", "RGB"),
-    PixelFormat.BGR24: ("RGB", "BGR"),
-    PixelFormat.RGBA: ("RGBA", "RGBA"),
-    PixelFormat.BGRA: ("RGBA", "BGRA"),
-}
-_PACKED_ORDERS = {PixelFormat.RGB24: "RGB", PixelFormat.BGR24: "BGR"}
-_JPEG_FORMATS = (*_PACKED_ORDERS, PixelFormat.YUVJ420P)
-_PROFILE_SPACES = {"L": b"GRAY", "RGB": b"RGB ", "RGBA": b"RGB "}
-_LONGEST_SIDE_PX = {"jpeg": 65_500, "png": 2**31 - 1, "webp": 16_383}
-_MAX_JPEG_EXIF_BYTES = 65_533 - 6
-#: More than any camera writes or any press needs: it would come back with every picture.
+#: More than any camera writes: it would come back with every picture.
 _MAX_EXIF_BYTES = 1 << 20
-_MAX_PROFILE_BYTES = 4 << 20
 # A reduced decode averages over whole blocks, and the padding of the last block shows in a picture that is only thin.
 _SHORTEST_DRAFT_PX = 64
 # Half of 1920 is near enough to 1024, and costs far less than the next larger scale.
 _REDUCED_SHARE = 0.9
 _FIRST_TURNED = 5  # EXIF orientations 5 to 8 exchange width and height
-_SUBSAMPLING = "4:2:0"
-_WHITE = (255, 255, 255)
 
 
 class Limits(Protocol):
@@ -111,7 +104,7 @@ class PillowCodec:
         """Reads the header only; raises EmptyBody, UnsupportedMediaType, InvalidImage, TooManyPixels."""
         image_format = sniff(body)
         image = self._open(body, image_format)
-        return ImageHeader(image_format, image.width, image.height, _has_alpha(image))
+        return ImageHeader(image_format, image.width, image.height, has_alpha(image))
 
     def origin(self, body: bytes) -> PictureOrigin:
         """Reads the header only; raises as :meth:`probe`."""
@@ -146,19 +139,20 @@ class PillowCodec:
             # TIFF is turned upright by its plugin, and its EXIF block is the file itself
             block = exif.bare(image.info.get("exif") or b"") if image_format != "tiff" else b""
             method = _UPRIGHT.get(exif.orientation(block))
-            profile = _bounded_profile(image)
+            profile = bounded_profile(image)
             if pixels is not None and method is None:
                 frame = Frame(PixelFormat.RGB24, image.width, image.height, pixels.reshape(-1))
             else:
-                plain = _plain(image, profile) if pixels is None else Image.fromarray(pixels)
+                picture = plain(image, profile) if pixels is None else Image.fromarray(pixels)
                 if method is not None:
-                    plain = plain.transpose(method)
-                frame = Frame(_PIXEL_FORMATS[plain.mode], plain.width, plain.height, np.asarray(plain).reshape(-1))
+                    picture = picture.transpose(method)
+                layout = _PIXEL_FORMATS[picture.mode]
+                frame = Frame(layout, picture.width, picture.height, np.asarray(picture).reshape(-1))
         return DecodedImage(
             frame,
             image_format,
             exif=(exif.upright(block) if 0 < len(block) <= _MAX_EXIF_BYTES else None),
-            icc_profile=profile if _describes(profile, _MODES[frame.pixel_format]) else None,
+            icc_profile=profile if describes(profile, _MODES[frame.pixel_format]) else None,
             upright=method is None,
             chroma_subsampling=_subsampling(image),
         )
@@ -168,20 +162,20 @@ class PillowCodec:
     ) -> DecodedImage | None:
         """An upright 4:2:0 picture of even size as its planes; None if it is none, or they cannot be had."""
         block = exif.bare(image.info.get("exif") or b"")
-        if _UPRIGHT.get(exif.orientation(block)) is not None or _subsampling(image) != _SUBSAMPLING:
+        if _UPRIGHT.get(exif.orientation(block)) is not None or _subsampling(image) != SUBSAMPLING:
             return None
         if any(side % 2 for side in image.size):  # simplejpeg encodes planes of even sizes only
             return None
         data = self._planes.decode(body, image.size, place)
         if data is None:
             return None
-        profile = _bounded_profile(image)
+        profile = bounded_profile(image)
         return DecodedImage(
             Frame(PixelFormat.YUVJ420P, image.width, image.height, data),
             "jpeg",
             exif=(exif.upright(block) if 0 < len(block) <= _MAX_EXIF_BYTES else None),
-            icc_profile=profile if _describes(profile, "RGB") else None,
-            chroma_subsampling=_SUBSAMPLING,
+            icc_profile=profile if describes(profile, "RGB") else None,
+            chroma_subsampling=SUBSAMPLING,
         )
 
     def decode_grey(self, body: bytes, longest_px: int) -> Bytes:
@@ -197,8 +191,7 @@ class PillowCodec:
             luma = _reduced_luma(body, image, longest_px) if image_format == "jpeg" else None
             if luma is None:
                 image.load()
-                plain = _flat(_plain(image, None)).convert("L")
-                luma = np.asarray(plain)
+                luma = np.asarray(flat(plain(image, None)).convert("L"))
             grey: Bytes = luma
             if method is not None:
                 grey = np.asarray(Image.fromarray(grey).transpose(method))
@@ -219,19 +212,19 @@ class PillowCodec:
             raise InvalidOption(f"format={image_format!r} is not written.", allowed=", ".join(WRITTEN_FORMATS))
         if not 1 <= quality <= 100:
             raise InvalidOption(f"quality={quality} is out of range.", allowed="1..100")
-        if max(image.frame.width, image.frame.height) > _LONGEST_SIDE_PX[image_format]:
+        if max(image.frame.width, image.frame.height) > LONGEST_SIDE_PX[image_format]:
             raise InvalidOption(
                 f"A picture of {image.frame.width}x{image.frame.height} pixels does not fit into {image_format}.",
-                allowed=f"{_LONGEST_SIDE_PX[image_format]} pixels a side, or png",
+                allowed=f"{LONGEST_SIDE_PX[image_format]} pixels a side, or png",
             )
-        if image_format == "jpeg" and image.frame.pixel_format in _JPEG_FORMATS:
-            return _encode_jpeg(image, quality)
-        picture = _picture(image.frame)
+        if image_format == "jpeg" and image.frame.pixel_format in JPEG_FORMATS:
+            return encode_jpeg(image, quality)
+        picture = picture_of(image.frame)
         if image_format == "jpeg":
-            picture = _flat(picture)
+            picture = flat(picture)
         elif image_format == "webp" and picture.mode == "L":
             picture = picture.convert("RGB")
-        options = _metadata(image, image_format, picture.mode) | _options(image, image_format, quality)
+        options = metadata_of(image, image_format, picture.mode) | options_of(image, image_format, quality)
         out = io.BytesIO()
         with _translated(image_format):
             picture.save(out, image_format, **options)
@@ -301,93 +294,6 @@ def _reduced_luma(body: bytes, image: Image.Image, longest_px: int) -> Bytes | N
     if min(image.size) < _SHORTEST_DRAFT_PX:
         share = 1.0
     return decode_luma(body, max(1, round(image.width * share)), max(1, round(image.height * share)))
-
-
-def _has_alpha(image: Image.Image) -> bool:
-    return image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info
-
-
-def _plain(image: Image.Image, profile: bytes | None) -> Image.Image:
-    """The loaded picture in mode L, RGB or RGBA."""
-    if image.mode.startswith("I;16"):
-        return Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
-    if image.mode in ("I", "F"):
-        raise InvalidImage("The image has 32-bit samples.", allowed="8 or 16 bits a sample")
-    if _has_alpha(image):
-        return image.convert("RGBA")
-    if image.mode == "CMYK" and _describes(profile, "CMYK") and profile is not None:
-        return _to_srgb(image, profile)
-    if image.mode in ("1", "L"):
-        return image.convert("L")
-    return image.convert("RGB")
-
-
-def _to_srgb(image: Image.Image, profile: bytes) -> Image.Image:
-    try:
-        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
-        converted = ImageCms.profileToProfile(image, source, ImageCms.createProfile("sRGB"), outputMode="RGB")
-    except (ImageCms.PyCMSError, OSError):  # a broken profile is as good as none
-        converted = None
-    return image.convert("RGB") if converted is None else converted
-
-
-def _bounded_profile(image: Image.Image) -> bytes | None:
-    profile = image.info.get("icc_profile") or None
-    if profile is not None and len(profile) > _MAX_PROFILE_BYTES:
-        raise InvalidImage(f"An ICC profile of {len(profile)} bytes.", allowed=f"{_MAX_PROFILE_BYTES} bytes")
-    return profile
-
-
-def _describes(profile: bytes | None, mode: str) -> bool:
-    """Whether the colour space of an ICC profile (ICC.1:2022, bytes 16 to 19) is that of the samples."""
-    return profile is not None and profile[16:20] == {**_PROFILE_SPACES, "CMYK": b"CMYK"}.get(mode)
-
-
-def _flat(picture: Image.Image) -> Image.Image:
-    if picture.mode != "RGBA":
-        return picture
-    flat = Image.new("RGB", picture.size, _WHITE)
-    flat.paste(picture, mask=picture.getchannel("A"))
-    return flat
-
-
-def _picture(frame: Frame) -> Image.Image:
-    modes = _RAW_MODES.get(frame.pixel_format)
-    if modes is None:
-        raise InvalidFrame(f"{frame.pixel_format} frames are not encoded.", allowed=", ".join(_RAW_MODES))
-    mode, raw_mode = modes
-    data = np.ascontiguousarray(frame.data)
-    return Image.frombuffer(mode, (frame.width, frame.height), data, "raw", raw_mode, 0, 1)
-
-
-def _encode_jpeg(image: DecodedImage, quality: int) -> bytes:
-    metadata = _metadata(image, "jpeg", "RGB")
-    kept = metadata.get("exif"), metadata.get("icc_profile")
-    frame = image.frame
-    if frame.pixel_format is PixelFormat.YUVJ420P:
-        return encode_planes(frame.plane_arrays(), quality, *kept)
-    pixels = np.ascontiguousarray(frame.data).reshape(frame.height, frame.width, 3)
-    order = _PACKED_ORDERS[frame.pixel_format]
-    subsampling = image.chroma_subsampling or _SUBSAMPLING
-    return encode_packed(pixels, order, quality, subsampling, *kept)
-
-
-def _metadata(image: DecodedImage, image_format: str, mode: str) -> dict[str, bytes]:
-    metadata = {}
-    if image.icc_profile is not None and _describes(image.icc_profile, mode):
-        metadata["icc_profile"] = image.icc_profile
-    if image.exif and (image_format != "jpeg" or len(image.exif) <= _MAX_JPEG_EXIF_BYTES):
-        metadata["exif"] = b"Exif\0\0" + image.exif
-    return metadata
-
-
-def _options(image: DecodedImage, image_format: str, quality: int) -> dict[str, object]:
-    if image_format == "jpeg":
-        return {"quality": quality, "subsampling": image.chroma_subsampling or _SUBSAMPLING}
-    if image_format == "webp":
-        return {"quality": quality, "method": 2}
-    # run lengths only: on photographs half the time of the default for a few per cent of size
-    return {"compress_level": 1, "compress_type": zlib.Z_RLE}
 
 
 def _subsampling(image: Image.Image) -> str | None:
