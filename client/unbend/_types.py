@@ -170,8 +170,9 @@ class GridRecord:
         grid_id: content-derived; stands for the grid in later calls.
         confidence: 0..1; ``confidence_kind`` says what it means (``mirror_agreement``, ``calibrated_probability`` or
             ``given``).
-        outcome: whether the grid changes anything; if not, ``reason`` says why (``low_confidence``,
-            ``nothing_to_correct`` or ``folded``).
+        outcome: whether the grid changes anything.
+        reason: why it changes nothing, or less than was estimated: ``low_confidence``, ``nothing_to_correct`` or
+            ``folded``; else empty.
         strength: share of the estimated correction that is in the grid.
         model: name of the network that estimated, empty for grids that came from elsewhere.
         grid: the lattice; None where only the id was asked for.
