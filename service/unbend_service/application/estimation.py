@@ -93,7 +93,7 @@ class Estimation:
         return await self.of_grey(grey)
 
     async def record(self, estimate: Estimate, correct: Correct, min_confidence: float | None = None) -> GridRecord:
-        """The decision on an estimate, at full strength and without fit; stored and counted."""
+        """The decision on an estimate, before the strength and fit of a request; stored and counted."""
         caution = self._caution(estimate, correct, min_confidence)
         record = await self._blocking.run(
             "grid",
