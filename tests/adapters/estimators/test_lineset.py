@@ -15,7 +15,7 @@ from unbend_service.adapters.estimators import chains, lineset, picture_branch, 
 from unbend_service.adapters.estimators.cards import shipped_models
 from unbend_service.adapters.estimators.catalogue import load_estimator
 from unbend_service.application.ports import Bytes, Estimator
-from unbend_service.domain.decision import Caution, decide
+from unbend_service.domain.decision import TRUSTING, decide
 from unbend_service.domain.errors import ModelUnavailable
 from unbend_service.domain.homography import apply_homography, fit_homography, without_plane_part
 from unbend_service.domain.maps import Float64, target_lattice
@@ -108,7 +108,7 @@ def test_the_weights_of_clear_provenance_straighten_too() -> None:
     assert error < 0.25 * nothing
     estimate = free.estimate(picture)
     assert estimate.model.name == "lineset-free"
-    assert estimate.confidence >= free.model.caution.min_confidence
+    assert estimate.confidence >= free.model.caution.full_confidence
 
 
 @pytest.mark.parametrize("shape", [(256, 256), (1, 1), (3, 2000)])
@@ -176,7 +176,7 @@ def test_a_picture_has_one_grid_wherever_it_lies_in_memory_and_however_many_thre
         moved = memory[turn : turn + picture.size].reshape(picture.shape)
         moved[:] = picture
         estimate = (estimator, two_threads)[turn % 2].estimate(moved)
-        record = decide(estimate.guides, 1.0, "", "", correct=Correct.NONLINEAR, caution=Caution())
+        record = decide(estimate.guides, 1.0, "", "", correct=Correct.NONLINEAR, caution=TRUSTING)
         assert record.outcome is Outcome.CORRECTED
         seen.add((record.grid.id, estimate.confidence, estimate.guides.rows.coefficients.tobytes()))
     assert len(seen) == 1

@@ -19,8 +19,6 @@ from google.protobuf.message_factory import GetMessageClass
 
 #: Nodes with graphs of their own, which see names of the outer one without saying so.
 _NESTED = frozenset({"If", "Loop", "Scan", "SequenceMap"})
-#: Lead to integers and back; they are named like the tensor before them, but serve the convolution behind it.
-_OF_INTEGERS = frozenset({"QuantizeLinear", "DequantizeLinear"})
 _FLOAT = 1
 _FIELDS: dict[str, dict[str, tuple[int, str, bool]]] = {
     "Node": {"input": (1, "", True), "output": (2, "", True), "name": (3, "", False), "op_type": (4, "", False)},
@@ -78,7 +76,7 @@ def headed(network: bytes, module: str) -> Parts | None:
         network: a serialised ``ModelProto`` with its weights inside.
         module: what the names of the module's nodes begin with, as exporting gave them.
     """
-    return _split(network, lambda node: node.name.startswith(module) and node.op_type not in _OF_INTEGERS)
+    return _split(network, lambda node: node.name.startswith(module))
 
 
 def _split(network: bytes, is_early: Callable[[Any], bool]) -> Parts | None:

@@ -43,6 +43,7 @@ class ChainsAnswer:
 #: log expected errors (2, 2): of everything, and of the nonlinear part; px of a picture whose long side has 256.
 Fused = Callable[[ChainsAnswer], tuple[Float32, Float32]]
 
+#: What the names of the front end's nodes begin with, by the modules that `training.picture_export` traces.
 _FRONT = "/branch/front/"
 _CHAINS_ANSWER = ("chain_nodes", "chain_spreads", "chain_state")
 
