@@ -90,7 +90,7 @@ def measure(
 
 def _applied(guides: Guides, confidence: float, caution: Caution) -> tuple[Grid, float]:
     """What the service would make of it, and how much of the estimate that is."""
-    record = decide(guides, confidence, "", "", correct=Correct.NONLINEAR, caution=caution, points=_LATTICE)
+    record = decide(guides, confidence, "", "", correct=Correct.NONLINEAR, caution=caution)
     return record.grid, record.strength
 
 
