@@ -140,6 +140,7 @@ class StreamGrid:
 
     async def close(self) -> None:
         """Ends what is under way."""
+        self._deciding = True  # an estimate that ends only now must not begin a decision
         if self._timer is not None:
             self._timer.cancel()
         tasks = [*self._tasks, *filter(None, [self._winning])]
